@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from typing import Any, Final, NamedTuple
 
 from adaptive.errors import DehystError
+from service.runtime.descriptors import too_many
 
 # --- Which packages a command needs beyond those of the client, and the extra of the installation that brings them.
 
@@ -184,6 +185,11 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
             raise
         print(f"dehyst {parsed.command}: {needed}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if not (said := too_many(error)):
+            raise
+        print(f"dehyst {parsed.command}: {said}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f"dehyst {parsed.command}: interrupted", file=sys.stderr)
         return 130

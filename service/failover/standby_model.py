@@ -61,7 +61,7 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
     for number in folder.numbers()[:_MAX_TRIED]:
         try:
             meta, state = folder.read(number)
-            rows = None if files.recordings is None else rows_behind(files.recordings, meta.samples)
+            rows = None if files.recordings is None else rows_behind(files.recordings, meta.samples, axis.owner)
             last_seq = meta.seq if rows is None else int(rows.seq[-1])
             if not _further((last_seq, meta.samples + (0 if rows is None else len(rows))), axis, newest_seq):
                 return ""

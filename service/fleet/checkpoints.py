@@ -18,10 +18,12 @@ from adaptive.fleet.fleet import Fleet
 from adaptive.types import StateDict, prefixed, under
 from service.config.settings import LEARN
 from service.protocol.model import digests
-from service.storage.checkpoint import SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
+from service.storage.checkpoint import LOCK, SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.output import atomic_write
-from service.storage.segments import claim
+from service.storage.owner import FolderOwner
 
+#: How long a start waits for a process that still holds the folder, s.
+_HOLD_S = 5.0
 #: Most copies of states that wait to be written.
 _MOST_WAITING = 3
 
@@ -29,12 +31,12 @@ _MOST_WAITING = 3
 class FleetCheckpoints:
     """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet_0``.
 
-    Raises BlockingIOError where another process writes into the folder.
+    Raises FieldError where the folder is another's.
     """
 
     def __init__(self, fleet: Fleet, directory: Path, stage: str, instance: str, period_s: float) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
-        self._lock = claim(directory, ".lock-checkpoints", "keeps its checkpoints in")
+        self._owner = FolderOwner(directory, LOCK, f"{stage}/fleet")
+        self._owner.hold("fleet.checkpoints", _HOLD_S)
         self._fleet, self._directory, self._names = fleet, directory, (stage, instance)
         self._step_s = period_s / fleet.axes
         self._axis, self._due_s = 0, time.monotonic()
@@ -77,7 +79,7 @@ class FleetCheckpoints:
         """Write all axes once more and end the thread."""
         self.write(range(self._fleet.axes))
         self._writer.shutdown()
-        self._lock.close()
+        self._owner.release()
 
     def write(self, axes: Iterable[int]) -> bool:
         """Write some axes now and wait for the disk; whether all of them are there."""

@@ -33,10 +33,12 @@ _LONGEST_JOB_S: Final = 60.0
 
 
 class Arrived(NamedTuple):
-    """Samples of one or more messages, and the time of arrival of the last one by ``time.monotonic``, s."""
+    """Samples of one or more messages, the time of arrival of the last one by ``time.monotonic``, s, and how many
+    samples were left out before them."""
 
     batch: SampleBatch
     at_s: float
+    left_out: int = 0
 
 
 class Job(NamedTuple):
@@ -86,6 +88,8 @@ class SampleQueue:
         self._taker: threading.Thread | None = None
         self._closing = False
         self._until_s = math.inf
+        #: Samples left out since the last that were queued.
+        self._left_out = 0
 
     # ---- putting, from any thread
 
@@ -97,11 +101,18 @@ class SampleQueue:
                 self.handled_at_s = at_s
             if self._closing or self.waiting + len(batch) > self.capacity:
                 self.dropped += len(batch)
+                self._left_out += len(batch)
                 return False
-            self._items.append(Arrived(batch, at_s))
+            self._items.append(Arrived(batch, at_s, self._left_out))
+            self._left_out = 0
             self.waiting += len(batch)
             self._changed.notify()
         return True
+
+    def leave_out(self, count: int) -> None:
+        """``count`` samples that came are not queued: their numbers are missing in those that come next."""
+        with self._changed:
+            self._left_out += count
 
     def count_malformed(self) -> int:
         """Count a message that could not be decoded; returns how many there were."""
@@ -187,7 +198,7 @@ class SampleQueue:
         if not behind:
             time.sleep(GATHER_S)
         batches: list[SampleBatch] = []
-        at_s, count = 0.0, 0
+        at_s, count, left_out = 0.0, 0, 0
         with self._changed:
             if self._urgent:
                 return self._urgent.popleft()
@@ -199,7 +210,8 @@ class SampleQueue:
                 self._items.popleft()
                 batches.append(arrived.batch)
                 at_s = arrived.at_s
-        return Arrived(batches[0] if len(batches) == 1 else joined(batches), at_s)
+                left_out += arrived.left_out
+        return Arrived(batches[0] if len(batches) == 1 else joined(batches), at_s, left_out)
 
     def finish(self, arrived: Arrived, handled: bool) -> None:
         """The samples of `take` no longer wait. ``handled`` : without an exception."""

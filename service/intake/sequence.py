@@ -55,7 +55,8 @@ _MOST_FIRST: Final = 2**52
 class SequenceTracker:
     """Classifies the numbers of arriving samples and maps them to one count that never decreases.
 
-    ``refuted`` : the number far ahead that later samples have just contradicted, -1 for none.
+    ``refuted`` : the number far ahead that later samples have just contradicted, -1 for none. ``left_out`` : numbers
+    skipped because this process left their samples out (see `leave_out`), which are none of ``lost``.
     """
 
     last: Annotated[int, Entry("highest number in order in the stage's present count, -1 before any", low=-1)]
@@ -79,6 +80,7 @@ class SequenceTracker:
         self.late = 0
         self.restarts = 0
         self.refuted = -1
+        self.left_out = self._to_skip = 0
         self._dt_s = dt_s
         self._confirmations = _between(_LEAST_CONFIRMATIONS, _AHEAD_S / dt_s, MOST_CONFIRMATIONS)
         self._restart_after = _between(MOST_CONFIRMATIONS, _RESTART_S / dt_s, RESTART_AFTER)
@@ -113,6 +115,10 @@ class SequenceTracker:
         self.last, self._t_s = seq, t_s
         self._since += 1
         return IN_ORDER
+
+    def leave_out(self, count: int) -> None:
+        """This process has left out ``count`` samples before those that are taken next."""
+        self._to_skip += count
 
     def take_refuted(self) -> int:
         """Return ``refuted`` and reset it to -1."""
@@ -184,13 +190,17 @@ class SequenceTracker:
             # Numbers after the gap count from the beginning of the claim, wherever the stage's counter began.
             self._offset = self.number(self.last) + _NEW_COUNT_GAP - self._run_first
             self.restarts += 1
+            self._to_skip = 0
             self._gaps.clear()
         self.last, self._t_s, self._since, self._run = seq, t_s, 1, 0
         return order
 
     def _skip(self, seq: int, lost: int) -> None:
         """Continue the count with ``seq``; ``lost`` of the numbers in between never arrived."""
-        self.lost += lost
+        left_out = min(lost, self._to_skip)
+        self._to_skip -= left_out
+        self.left_out += left_out
+        self.lost += lost - left_out
         self._gaps.append((self.last + 1, seq - 1))
         if lost > MOST_CONFIRMATIONS:
             self._since = 0

@@ -7,7 +7,10 @@ missing, and ``dehyst_up`` tells how many instances answered.
 from __future__ import annotations
 
 import contextlib
+import io
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
@@ -117,12 +120,66 @@ def _number(status: dict[str, Any], path: tuple[str, ...]) -> float | None:
     return float(value) if isinstance(value, bool | int | float) else None
 
 
+#: Longest time for reading a request, and for sending the page, s; and the most connections at a time.
+REQUEST_S: Final = 5.0
+MOST_CONNECTIONS: Final = 16
+
+
+class _Server(ThreadingHTTPServer):
+    """Closes at once what comes while there are `MOST_CONNECTIONS`."""
+
+    request_queue_size = 128
+
+    def __init__(self, *args: Any) -> None:
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        super().__init__(*args)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, *_: object) -> None:
+        """Print nothing where a client has gone away."""
+
+
+class _Request(io.RawIOBase):
+    """What a connection sends in `REQUEST_S`. The timeout of a socket alone begins anew with each byte."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._until = time.monotonic() + REQUEST_S
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        rest_s = self._until - time.monotonic()
+        if rest_s <= 0.0:
+            raise TimeoutError
+        self._connection.settimeout(rest_s)
+        return self._connection.recv_into(buffer)
+
+
 @contextlib.contextmanager
 def serve_page(address: str, port: int, collect: Callable[[], bytes]) -> Iterator[int]:
     """Serve what ``collect`` returns at ``/metrics`` while the block runs; gives the port. Raises InputError."""
 
     class Handler(BaseHTTPRequestHandler):
+        def setup(self) -> None:
+            super().setup()
+            self.rfile.close()
+            self.rfile = io.BufferedReader(_Request(self.connection))
+
         def do_GET(self) -> None:
+            self.connection.settimeout(REQUEST_S)  # of all that is sent
             if self.path.split("?")[0] not in ("/", "/metrics"):
                 self.send_error(404, "the page is /metrics")
                 return
@@ -142,7 +199,7 @@ def serve_page(address: str, port: int, collect: Callable[[], bytes]) -> Iterato
 
     page(())  # says at once that the package is missing
     try:
-        server = ThreadingHTTPServer((address, port), Handler)
+        server = _Server((address, port), Handler)
     except OSError as error:
         raise InputError(
             f"--port {port}: cannot listen at {address} ({error.strerror}): choose another port, or 0 for a free one"

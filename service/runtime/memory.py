@@ -74,13 +74,16 @@ class _Mallinfo2(ctypes.Structure):
 
 def in_use() -> dict[str, int | None]:
     """What this process holds: ``resident_bytes``; ``malloc_bytes``, handed out by the C library's allocator and not
-    given back to it (None where that cannot tell); ``python_blocks``, of Python's own allocator for small objects.
+    given back to it; ``python_blocks``, of Python's own allocator for small objects. None for what cannot be told.
 
     Resident memory goes up and down by megabytes with what lies free between other things; the other two do not, and
     tell a leak early.
     """
+    resident_bytes = None
+    with contextlib.suppress(OSError):  # no file descriptor is left: a status needs none
+        resident_bytes = int(_PROCESS.memory_info().rss)
     return {
-        "resident_bytes": _PROCESS.memory_info().rss,
+        "resident_bytes": resident_bytes,
         "malloc_bytes": _malloc_bytes(),
         "python_blocks": sys.getallocatedblocks(),
     }

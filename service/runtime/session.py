@@ -19,6 +19,7 @@ from typing import Any, Final
 import zenoh
 
 from service.protocol.errors import FieldError, SessionError
+from service.runtime.descriptors import too_few
 
 # --- Delivery of messages that are sent only once, and whether a publisher has subscribers.
 
@@ -199,7 +200,7 @@ def _open(
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise SessionError(_advice(str(error), listen, connect)) from error
+        raise SessionError(too_few() or _advice(str(error), listen, connect)) from error
 
 
 def _advice(text: str, listen: Sequence[str], connect: Sequence[str]) -> str:

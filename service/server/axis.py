@@ -62,6 +62,7 @@ LEVELS: Final = {
     "stale": logging.WARNING,
     "samples_dropped": logging.WARNING,
     "thinned": logging.WARNING,
+    "stopped_behind": logging.WARNING,
     "limits_narrow": logging.WARNING,
     "model_clipped": logging.WARNING,
     "rate_too_high": logging.WARNING,
@@ -256,6 +257,8 @@ class Axis:
         self.handled_seq = -1
         self._archive = archive
         self._identified = {name: model for name, model in models.items() if name != AUTO}
+        #: Whose its files are, see `service.storage.owner`.
+        self.owner = f"{stage}/{config.name}"
         self._events = EventLog(stage, config.name)
         self._limiter = EventLimiter(calm=round(1.0 / self.dt_s))
         self._gates: dict[str, int] = {}
@@ -265,7 +268,7 @@ class Axis:
         self._recent: list[tuple[int, float]] = [(-1, 0.0)] * _RECENT
         self._refused = self._foreign = 0
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
-        self.counts = SampleCounts(-1, self.sequence.counters(), {})
+        self.counts = SampleCounts(-1, {**self.sequence.counters(), "left_out": 0}, {})
         self._age_s: float | None = None
         #: Queries whose samples under way began far ahead of the stage; and whether the last one did.
         self.far_ahead = 0
@@ -443,7 +446,7 @@ class Axis:
         return verdict
 
     def _update_counts(self) -> None:
-        counts = self.sequence.counters()
+        counts = {**self.sequence.counters(), "left_out": self.sequence.left_out}
         self.counts = SampleCounts(self.handled_seq, counts, self.gates, self._refused, self._foreign)
 
     def _count_refused(self, order: str, seq: int, y_um: float) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 from numpy.typing import ArrayLike
 
 from service.background.retuner import Retuner
-from service.intake.sample_queue import Job, SampleQueue, Thinner
+from service.intake.sample_queue import Arrived, Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -25,8 +25,10 @@ from service.server.learner_supervisor import standing_of
 DROPPED: Final = "dropped"
 #: Verdict, in a recording, on samples that were left out because the learner cannot keep up.
 THINNED: Final = "thinned"
+#: Verdict, in a recording, on samples that still waited when the service stopped; the next start learns them.
+WAITED: Final = "waited"
 #: Longest time for which the samples that wait are handled at the end, s.
-DRAIN_S: Final = 2.0
+DRAIN_S: Final = 0.5
 
 #: Interval at which diagnostics are read, s of samples, and how many such intervals pass between two readings of the
 #: window's points.
@@ -174,14 +176,19 @@ class AxisLoop:
                 del item  # an exception in it refers to the work
                 self._announce()
                 continue
-            handled = True
-            try:
-                self.handle(item.batch)
-            except Exception as error:
-                # The samples after it are handled: clients wait for their snapshots.
-                handled = False
-                self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
-            self.queue.finish(item, handled)
+            self.take(item)
+
+    def take(self, item: Arrived) -> None:
+        """Handle what the queue has handed out; in the thread of the axis."""
+        handled = True
+        self.axis.sequence.leave_out(item.left_out)
+        try:
+            self.handle(item.batch)
+        except Exception as error:
+            # The samples after it are handled: clients wait for their snapshots.
+            handled = False
+            self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
+        self.queue.finish(item, handled)
 
     def handle(self, batch: SampleBatch) -> None:
         """One batch through the whole axis; in the thread of the axis, or before it has started."""
@@ -215,8 +222,10 @@ class AxisLoop:
         if self.thinner.watch(self.queue.waiting, time.monotonic()):
             self._note_thinning()
         kept, left_out = self.thinner.split(batch)
-        if left_out is not None and self.sink is not None:
-            self.sink.put_aside(left_out.seq, left_out.t_s, left_out.u_V, left_out.y_um, THINNED)
+        if left_out is not None:
+            self.queue.leave_out(len(left_out))
+            if self.sink is not None:
+                self.sink.put_aside(left_out.seq, left_out.t_s, left_out.u_V, left_out.y_um, THINNED)
         return kept is None or self._queue(kept)
 
     def _note_thinning(self) -> None:
@@ -265,10 +274,20 @@ class AxisLoop:
         self._thread.start()
 
     def close(self) -> None:
-        """Handle what is queued, for `DRAIN_S` at most, then end the thread; what is left is recorded aside."""
+        """Handle what is queued, for `DRAIN_S` at most, then end the thread; the rest is recorded without being learnt.
+
+        It is recorded as the next in the order of handling, so that a start from the last checkpoint learns it.
+        """
         self.queue.close(DRAIN_S)
         if self._thread.is_alive():
             self._thread.join()
-        for batch in self.queue.leave():
+        left = self.queue.leave()
+        if not left:
+            return
+        for batch in left:
             if self.sink is not None:
-                self.sink.put_aside(batch.seq, batch.t_s, batch.u_V, batch.y_um, DROPPED)
+                self.sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, WAITED)
+        config = self.axis.config
+        learns = "and the next start learns them" if config.checkpoints is not None else "and are not learnt"
+        where = "lost: nothing is recorded" if self.sink is None else f"in the recording, {learns}"
+        self.axis.note("stopped_behind", f"{sum(map(len, left))} samples still waited; they are {where}")

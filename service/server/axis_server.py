@@ -24,7 +24,7 @@ from service.security.lease import Holders
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
-from service.server.health import Arrivals, Health, SampleLosses
+from service.server.health import Arrivals, DiskFailures, Health, SampleLosses
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, WriteRate, axis_status
@@ -108,6 +108,7 @@ class AxisServer:
         self._session = session
         self._stale = False
         self._losses = SampleLosses()
+        self._disk_failures = DiskFailures()
         self._write_rate = WriteRate()
         self._health = Health()
         self._health_at_s = -math.inf
@@ -247,6 +248,7 @@ class AxisServer:
         self._look_for_losses(now_s)
         if now_s - self._health_at_s >= HEALTH_S:
             self._health_at_s = now_s
+            self._look_at_disk()
             samples = self.status()["samples"]
             self._health.update(now_s, samples["received"], samples["dropped"], samples["gates"])
         with self._changing:
@@ -273,15 +275,25 @@ class AxisServer:
     def _look_for_losses(self, now_s: float) -> None:
         """Note when samples come and are lost, and when that is over."""
         queue, counts, before = self.loop.queue, self.axis.counts, self._losses.trouble
-        received, left_out = counts.samples["received"], queue.dropped + self.loop.thinner.thinned
-        lost = max(0, counts.samples["lost"] - left_out)
+        received, lost = counts.samples["received"], counts.samples["lost"]
         arrivals = Arrivals(received, counts.refused, counts.foreign, queue.dropped, queue.malformed, lost)
-        if not self._losses.look(now_s, arrivals):
-            return
-        if self._losses.trouble:
-            self.axis.note("trouble", f"{self._losses.trouble} ({self._losses.why})")
+        if self._losses.look(now_s, arrivals):
+            self._note_trouble(before, self._losses.trouble, self._losses.why)
+
+    def _look_at_disk(self) -> None:
+        """Note when samples or checkpoints do not reach the disk, and when that is over."""
+        failures, before = self._disk_failures, self._disk_failures.trouble
+        if failures.look(self._recorder(), self.checkpoints.counters()):
+            self._note_trouble(before, failures.trouble, failures.why)
+
+    def _note_trouble(self, before: str, now: str, why: str) -> None:
+        if now:
+            self.axis.note("trouble", f"{now} ({why})")
         else:
             self.axis.note("recovered", before)
+
+    def _recorder(self) -> dict[str, Any] | None:
+        return None if self.loop.sink is None else self.loop.sink.counters()
 
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
@@ -294,7 +306,7 @@ class AxisServer:
             epoch=self.epoch,
             synced=self.synced,
             stale=self._stale,
-            losses=self._losses.trouble,
+            losses=self._losses.trouble or self._disk_failures.trouble,
             checkpoints=self.checkpoints.counters(),
             operations=self._operations.counters(),
             waiting_points=self._long_queries.waiting_points,
@@ -311,10 +323,10 @@ class AxisServer:
 
     def _disk(self) -> dict[str, float | None] | None:
         """What is written to the disk; None where neither samples nor checkpoints are kept."""
-        sink, kept = self.loop.sink, self.checkpoints
-        if sink is None and kept.folder is None:
+        recorder, kept = self._recorder(), self.checkpoints
+        if recorder is None and kept.folder is None:
             return None
-        recorded = 0 if sink is None else int(sink.counters().get("bytes", 0))
+        recorded = 0 if recorder is None else int(recorder.get("bytes", 0))
         with self._changing:
             return self._write_rate.look(time.monotonic(), recorded + kept.bytes_in_all)
 

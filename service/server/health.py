@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 #: Time over which rates and shares are taken, s, and the shortest one that is judged.
@@ -58,7 +59,8 @@ class Health:
         """(state, reason in words) for a status without them; ``factor`` : by which samples are thinned."""
         if status["trouble"]:
             where = "docs/troubleshooting.md says what it means and what to do"
-            return str(status["trouble"]), "; ".join(filter(None, (status.get("trouble_why"), where)))
+            lost = _lost(status) if status["trouble"] == NOT_RECORDED else ""
+            return str(status["trouble"]), "; ".join(filter(None, (status.get("trouble_why"), lost, where)))
         if status["stale"]:
             return "stale", "no samples come, or too many wait to be learnt"
         if status["frozen"]:
@@ -184,3 +186,43 @@ def _named(came: Arrivals, *halves: Arrivals) -> tuple[str, str]:
             return SAMPLES_MALFORMED, f"{came.malformed} messages could not be decoded, and {missing}"
         return SAMPLES_LOST, f"{missing}: samples are lost on the way, or the stage leaves numbers out"
     return "", ""
+
+
+# --- What of an axis does not reach the disk.
+
+NOT_RECORDED: Final = "samples_not_recorded"
+NOT_KEPT: Final = "checkpoints_not_written"
+
+_MEND: Final = "make room on the disk or mend it, and it goes on by itself"
+
+
+class DiskFailures:
+    """The watch over what an axis writes. One thread calls it, once a second or so.
+
+    Attributes
+    ----------
+    trouble : name of what is not written now, "" for nothing. why : the error behind it, and what to do.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = ""
+        self.why = ""
+        self._unrecorded = 0
+
+    def look(self, recorder: Mapping[str, Any] | None, checkpoints: Mapping[str, Any] | None) -> bool:
+        """Judge the counters of both, None for what is not kept; whether `trouble` has changed."""
+        before, self.trouble, self.why = self.trouble, "", ""
+        if checkpoints is not None and checkpoints.get("degraded"):
+            self.trouble, self.why = NOT_KEPT, f"{checkpoints['error']}: a restart goes back to the newest; {_MEND}"
+        if recorder is not None:
+            unrecorded = int(recorder.get("lost", 0)) + int(recorder.get("dropped", 0))
+            if recorder.get("degraded") or unrecorded > self._unrecorded:
+                self.trouble, self.why = NOT_RECORDED, f"{recorder.get('error') or 'the disk is too slow'}; {_MEND}"
+            self._unrecorded = unrecorded
+        return self.trouble != before
+
+
+def _lost(status: Mapping[str, Any]) -> str:
+    """What the recording of an axis lacks, in words."""
+    recorder = status.get("recorder") or {}
+    return f"{recorder.get('lost', 0) + recorder.get('dropped', 0)} samples since the start are in no recording"

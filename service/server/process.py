@@ -16,7 +16,7 @@ from typing import Any, Final
 import zenoh
 from threadpoolctl import threadpool_limits
 
-from service.config.settings import AxisConfig, ServeConfig
+from service.config.settings import ServeConfig
 from service.failover.role_control import Reachability, RoleControl
 from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
@@ -45,19 +45,23 @@ PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
-#: How long a start waits for a process that still holds the folder of the checkpoints, s.
+#: How long a start waits for a process that still holds a folder of its recordings or checkpoints, s.
 _HOLD_S: Final = 5.0
 #: Longest pause of the publishing thread, s.
 _TICK_S: Final = 0.02
 
 
-def make_recorder(config: AxisConfig) -> SampleSink | None:
-    """The recorder of an axis, or None if the configuration names no folder."""
+def make_recorder(axis: Axis) -> SampleSink | None:
+    """The recorder of an axis, or None if the configuration names no folder.
+
+    Raises FieldError where the folder is another's.
+    """
+    config = axis.config
     if config.recorder is None:
         return None
     from service.storage.recorder import Recorder, RecorderConfig
 
-    return Recorder(RecorderConfig(config.recorder, max_bytes=config.recorder_bytes))
+    return Recorder(RecorderConfig(config.recorder, axis.owner, max_bytes=config.recorder_bytes), hold_s=_HOLD_S)
 
 
 def make_watcher(axis: Axis) -> SampleWatcher | None:
@@ -195,7 +199,7 @@ class Service:
                     axis,
                     self.instance,
                     self._wake.set,
-                    make_recorder(axis.config),
+                    make_recorder(axis),
                     make_watcher(axis),
                     authenticator,
                     self._long_queries,

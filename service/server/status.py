@@ -19,7 +19,6 @@ from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed
 from service.security.authenticator import NO_KEY, Authenticator
 from service.security.refusals import refusal_counters
-from service.server.axis import SampleCounts
 from service.server.axis_loop import AxisLoop
 from service.server.deltas import DeltaStreams
 from service.server.health import Health
@@ -60,7 +59,8 @@ def axis_status(
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
-    ``losses`` : name of the way in which samples are lost. ``checkpoints``, ``operations`` : their counters.
+    ``losses`` : name of the way in which samples are lost, on the way here or to the disk. ``checkpoints``,
+    ``operations`` : their counters.
     ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
     ``command`` : who owns it, see `Holders`.
     ``disk`` : what is written, see `WriteRate`. ``signed`` : whether answers carry an authenticator.
@@ -91,7 +91,8 @@ def axis_status(
         "delta_hz": axis.config.delta_hz,
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
-            **_samples(counts, queue_dropped + thinned),
+            **counts.samples,
+            "received": counts.samples["received"] + queue_dropped + thinned,
             "thinned": thinned,
             "dropped": queue_dropped,
             "malformed": queue.malformed,
@@ -139,13 +140,6 @@ def axis_status(
         "rate_per_s": None if health.per_s is None else round(health.per_s, 1),
         "thinning": loop.thinner.factor,
     }
-
-
-def _samples(counts: SampleCounts, not_handled: int) -> dict[str, int]:
-    """The counters by order of arrival. Samples that came and were not handled are received, and none of the lost."""
-    samples = counts.samples
-    received, lost = samples["received"] + not_handled, max(0, samples["lost"] - not_handled)
-    return {**samples, "received": received, "lost": lost}
 
 
 #: Time over which the rate of writing is taken, s: some checkpoints.

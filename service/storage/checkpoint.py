@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.state import MOST_FLOAT, MOST_INT
@@ -28,14 +28,16 @@ from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
 from service.storage.output import atomic_write
-from service.storage.segments import claim, is_still_at, rows_behind
+from service.storage.owner import FolderOwner
+from service.storage.segments import rows_behind
 
 # --- Files.
 
 MAGIC: Final = b"DHCKPT01"
 _HEAD: Final = struct.Struct("<8sQ16s")
 SUFFIX: Final = ".ckpt"
-_LOCK: Final = ".lock-checkpoints"
+#: File that says whose checkpoints a folder holds, see `FolderOwner`.
+LOCK: Final = ".lock-checkpoints"
 #: Checkpoints that are never removed to make room on a full disk.
 _LEAST_KEPT: Final = 2
 
@@ -325,7 +327,9 @@ class CheckpointKeeper:
         self._closing = False
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
-        self._lock: IO[bytes] | None = None
+        self._owner: FolderOwner | None = None
+        if folder is not None:
+            self._owner = FolderOwner(folder.directory, LOCK, f"{stage}/{axis.config.name}")
         self._bytes = self._bytes_in_all = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
@@ -333,42 +337,12 @@ class CheckpointKeeper:
             self._thread.start()
 
     def hold(self, timeout_s: float) -> None:
-        """Lock the folder for this process: two services would remove and restore each other's files.
+        """Hold the folder for this process: two services would remove and restore each other's files.
 
-        Waits ``timeout_s`` for a process that ends. Raises FieldError if another process goes on holding it. Where the
-        disk does not allow a lock, writing fails later, and is counted.
+        Waits ``timeout_s`` for a process that ends. Raises FieldError where the folder stays another's.
         """
-        if self.folder is None:
-            return
-        until = time.monotonic() + timeout_s
-        while True:
-            try:
-                self._claim()
-            except BlockingIOError as error:
-                if time.monotonic() >= until:
-                    raise FieldError(
-                        "checkpoints",
-                        str(self.folder.directory),
-                        "a folder that no other process keeps its checkpoints in",
-                        "end the other service, or give each its own folder",
-                    ) from error
-                time.sleep(0.05)
-            except OSError:
-                return
-            else:
-                return
-
-    def _claim(self) -> None:
-        """Hold the lock; take it anew where the folder was removed. Raises OSError."""
-        assert self.folder is not None
-        directory = self.folder.directory
-        if self._lock is not None and is_still_at(self._lock.fileno(), directory / _LOCK):
-            return
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-        directory.mkdir(parents=True, exist_ok=True)
-        self._lock = claim(directory, _LOCK, "keeps its checkpoints in")
+        if self._owner is not None:
+            self._owner.hold("checkpoints", timeout_s)
 
     def on_snapshot(self) -> None:
         """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
@@ -430,9 +404,8 @@ class CheckpointKeeper:
             self._closing = True
             self._ready.notify_all()
         self._thread.join(10.0)
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        if self._owner is not None:
+            self._owner.release()
 
     def _meta(self) -> CheckpointMeta:
         stage, name, instance = self._names
@@ -451,6 +424,7 @@ class CheckpointKeeper:
 
     def _run(self) -> None:
         assert self.folder is not None
+        assert self._owner is not None
         while True:
             with self._ready:
                 while self._copied is None and not self._closing:
@@ -461,7 +435,7 @@ class CheckpointKeeper:
                 copy = self._copies
             written = False
             try:
-                self._claim()
+                self._owner.take()
                 self._bytes = self.folder.write(meta, state).stat().st_size
                 self._bytes_in_all += self._bytes
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
@@ -504,7 +478,7 @@ def learn_again(axis: Axis, recordings: Path, switch: Switch | None = None) -> i
     recorded a second time.
     """
     begun = axis.sequence.received
-    rows = rows_behind(recordings, begun)
+    rows = rows_behind(recordings, begun, axis.owner)
     count = 0 if rows is None else len(rows)
     first = max(0, count - _MOST_AGAIN)
     at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)

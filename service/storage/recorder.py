@@ -9,29 +9,33 @@ pause a new segment is started.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from service.protocol.errors import FieldError
+from service.storage.owner import FolderOwner
 from service.storage.segments import (
+    LOCK,
     RECORD,
     Closer,
     Journal,
     Rows,
     Syncer,
-    claim,
+    close_left_open,
     journal_of,
     left_open,
     make_room,
     next_number,
-    segments,
+    number_of,
 )
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
@@ -49,6 +53,7 @@ class RecorderConfig:
     Attributes
     ----------
     directory : folder of the segments; created if missing. Each axis needs its own.
+    owner : stage and axis, as ``demo/x``, to which the folder belongs from then on; "" for any.
     segment_rows : samples per segment (600,000 are ten minutes at 1 kHz, about 15 MB).
     max_bytes : size of all files together; beyond it the oldest closed segments are removed. The journals of the
         newest two segments, 40 bytes per sample, count too; segments are shorter where they would take more than half.
@@ -60,6 +65,7 @@ class RecorderConfig:
     """
 
     directory: Path
+    owner: str = ""
     segment_rows: int = 600_000
     max_bytes: int = 2_000_000_000
     queue_samples: int = 100_000
@@ -95,11 +101,19 @@ class Recorder:
     """Records the samples of one axis. Thread-safe; use it as a context manager, or call `close`.
 
     A failing disk never raises: a directory that cannot be created or written shows in `counters` and is tried again.
+
+    Parameters
+    ----------
+    index : number of the next sample in the order in which the axis handles them.
+    hold_s : how long to wait for a process that still holds the folder, s. FieldError is then raised where it belongs
+        to another. None: the folder is held from the first sample on, and another's shows in `counters`.
     """
 
-    def __init__(self, config: RecorderConfig, index: int = 0) -> None:
+    def __init__(self, config: RecorderConfig, index: int = 0, hold_s: float | None = None) -> None:
         self.config = config
-        #: Number of the next sample in the order in which the axis handles them.
+        self._folder = FolderOwner(config.directory, LOCK, config.owner)
+        if hold_s is not None:
+            self._folder.hold("recorder", hold_s)
         self.index = index
         self._queue: deque[tuple[int, Rows]] = deque()
         self._waiting = 0
@@ -111,9 +125,8 @@ class Recorder:
         self._salvaged = 0
         self._error = ""
         self._segment: Journal | None = None
-        self._claim: IO[bytes] | None = None
-        # Whether there may be journals to close, and whether one of them is from this recorder.
-        self._left_open, self._own = True, False
+        # Whether there may be journals to close, and the number of the first one that is of this recorder.
+        self._left_open, self._first = True, sys.maxsize
         self._closer: Closer | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
@@ -210,8 +223,7 @@ class Recorder:
         if self._segment is not None:
             self._segment.close()
         self._close_all()
-        if self._claim is not None:
-            self._claim.close()
+        self._folder.release()
 
     def _take(self) -> tuple[Rows, NDArray[np.int64]] | None:
         with self._lock:
@@ -236,11 +248,11 @@ class Recorder:
 
     def _begin_segment(self) -> Journal:
         directory = self.config.directory
-        directory.mkdir(parents=True, exist_ok=True)
-        if self._claim is None:
-            self._claim = claim(directory)
+        self._folder.take()
         self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
-        return Journal(journal_of(directory, next_number(directory)))
+        number = next_number(directory)
+        self._first = min(self._first, number)
+        return Journal(journal_of(directory, number))
 
     def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
         # After a failure: pause, except at the end, where one more attempt costs nothing.
@@ -259,7 +271,7 @@ class Recorder:
                 done = stop
                 if self._segment.rows >= self.config.rows:
                     self._segment.close()
-                    self._segment, self._left_open, self._own = None, True, True
+                    self._segment, self._left_open = None, True
             if self._segment is not None:
                 self._syncer.look(self._segment)
             if time.monotonic() >= max(self._not_before, self._told_until):
@@ -283,9 +295,6 @@ class Recorder:
             return
         self._segment.close()
         self._segment = None
-        if self._claim is not None:
-            self._claim.close()
-            self._claim = None
         self._told_until = now + self.config.retry_s
         with self._lock:
             self._counts["errors"] += 1
@@ -303,40 +312,30 @@ class Recorder:
                 self._failed(error)
         elif closer is not None and not closer.running:
             self._closer = None
-            self._take_result(closer)
+            self._take_result(closer.result)
 
-    def _take_result(self, closer: Closer) -> None:
+    def _take_result(self, closed: Callable[[], list[Path]]) -> None:
+        """``closed`` : closes segments, or waits until they are; returns them."""
         try:
-            made = closer.result()
-            newest = segments(self.config.directory)[-made:] if made else []
-            self._count(bytes=sum(path.stat().st_size for path in newest))
-            if self._own:
-                self._count(segments=made)
-            else:
-                self._salvaged += made
+            made = closed()
+            own = sum(number_of(path) >= self._first for path in made)
+            self._count(bytes=sum(path.stat().st_size for path in made), segments=own)
+            self._salvaged += len(made) - own
             self._count(removed=make_room(self.config.directory, self.config.max_bytes))
         except OSError as error:
             self._left_open = True
             self._failed(error)
 
     def _close_all(self) -> None:
-        """Wait for the segments that are being closed, then close the rest."""
+        """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
         if self._closer is not None:
-            self._take_result(self._closer)
-        if self._claim is None and not self._claim_leftovers():
-            return
-        self._own = self._own or self._segment is not None
-        try:
-            self._take_result(Closer(self.config.directory, None))
-        except OSError as error:
-            self._failed(error)
-
-    def _claim_leftovers(self) -> bool:
-        """Whether an earlier recorder left journals and this one, which has recorded nothing, could lock the folder."""
+            self._closer.kill()
         if not left_open(self.config.directory):
-            return False
-        try:
-            self._claim = claim(self.config.directory)
-        except OSError:
-            return False  # another process holds it, or the disk cannot be written
-        return True
+            return
+
+        def closed() -> list[Path]:
+            # One that has recorded nothing holds no folder yet, and leaves another's alone.
+            self._folder.take()
+            return close_left_open(self.config.directory)
+
+        self._take_result(closed)

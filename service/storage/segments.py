@@ -6,13 +6,13 @@ the newest closed segment stays until the next segment is closed: a restart lear
 it.
 
 ``python -m service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it as a
-process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service.
+process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service; at
+its end it closes them itself.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import subprocess
 import sys
@@ -21,7 +21,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from adaptive.types import FloatArray
 from service.background.job import step_back
 from service.protocol.errors import FieldError
 from service.storage.output import PART, atomic_write
+from service.storage.owner import FolderOwner, is_still_at, owner_of
 
 # --- The journal of a recording: samples appended as rows of fixed size, readable up to the last row after any crash.
 #
@@ -215,14 +216,14 @@ def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
 
 
 OPEN, CLOSED = ".journal", ".parquet"
+#: File that says whose recording a folder holds, see `FolderOwner`.
+LOCK: Final = ".lock"
 #: Suffix of the journal of a closed segment.
 DONE: Final = ".done"
 #: Prefix of the names of journals: readers that take the folder as one data set, such as pyarrow, skip such files.
 HIDDEN: Final = "_"
 #: Command-line argument for "no journal is being written".
 _NONE: Final = "-"
-#: Longest time for closing segments, s.
-_CONVERT_S: Final = 120.0
 
 
 def schema() -> Any:
@@ -292,25 +293,28 @@ class Closer:
         """Whether the process still runs."""
         return self._process.poll() is None
 
-    def result(self, timeout_s: float = _CONVERT_S) -> int:
-        """Wait for the process; returns the number of new segments. Raises OSError with its message if it failed."""
-        try:
-            out, err = self._process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
-            raise OSError(f"closing a segment took more than {timeout_s:g} s") from None
+    def kill(self) -> None:
+        """End the process: what it has not closed stays open."""
+        self._process.kill()
+        self._process.communicate()
+
+    def result(self) -> list[Path]:
+        """Wait for the process; returns the new segments. Raises OSError with its message if it failed."""
+        out, err = self._process.communicate()
         if self._process.returncode:
             words = err.strip().splitlines() or [f"ended with status {self._process.returncode}"]
             raise OSError(f"closing a segment: {words[-1]}")
-        return int(out)
+        return [Path(line) for line in out.splitlines()]
 
 
-def rows_behind(directory: Path, index: int) -> Rows | None:
+def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
     """The rows from the ``index``-th handled sample on, in the order of handling, up to the first missing one.
 
-    Returns None if the journals do not reach back to that sample, or hold no later one.
+    Returns None if the journals do not reach back to that sample, hold no later one, or are not those of ``owner``
+    (see `FolderOwner`).
     """
+    if owner_of(directory, LOCK) not in ("", owner):
+        return None
     columns: list[list[Any]] = [[] for _ in range(5)]
     for path in [*_sorted(directory, DONE), *_sorted(directory, OPEN)]:
         try:
@@ -334,42 +338,6 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
         return None
     seq, t_s, u_V, y_um, reason = columns
     return Rows(np.array(seq, dtype=np.int64), np.array(t_s), np.array(u_V), np.array(y_um), reason)
-
-
-def claim(directory: Path, name: str = ".lock", what: str = "records into") -> IO[bytes]:
-    """Lock the directory for this process until the returned file is closed.
-
-    Two recorders in one directory would each treat the open segment of the other as left by a crash. Raises
-    BlockingIOError if another process holds the lock; ``what`` it then does.
-    """
-    lock = open(directory / name, "wb")  # noqa: SIM115 - stays open as long as the recorder
-    try:
-        _lock_now(lock.fileno())
-    except OSError as error:
-        lock.close()
-        raise BlockingIOError(error.errno, f"another process {what} {directory}") from error
-    return lock
-
-
-def _lock_now(descriptor: int) -> None:
-    """Lock an open file until it is closed. Raises OSError where another process holds it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        msvcrt = importlib.import_module("msvcrt")
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_still_at(descriptor: int, path: Path) -> bool:
-    """Whether the open file is still the one at ``path``: neither removed nor renamed, nor its folder."""
-    try:
-        there = path.stat()
-    except OSError:
-        return False
-    here = os.fstat(descriptor)
-    return (here.st_dev, here.st_ino) == (there.st_dev, there.st_ino)
 
 
 def number_of(path: Path) -> int:
@@ -421,7 +389,7 @@ def _sorted(directory: Path, suffix: str) -> list[Path]:
 
 
 def main() -> int:
-    """Close the open segments in the directory given as first argument, and print their number.
+    """Close the open segments in the directory given as first argument, and print the path of each.
 
     A recorder, which holds the lock, passes the journal that it writes as second argument, or ``-``. Without a second
     argument this process takes the lock itself.
@@ -432,8 +400,9 @@ def main() -> int:
         step_back()
     try:
         if but is None:
-            held = claim(directory)  # noqa: F841 - held until the process ends
-        print(len(close_left_open(directory, None if but in (None, _NONE) else Path(but))))
+            FolderOwner(directory, LOCK).take()  # until the process ends
+        for path in close_left_open(directory, None if but in (None, _NONE) else Path(but)):
+            print(path)
     except OSError as error:
         print(f"{error.strerror or error}", file=sys.stderr)
         return 1

@@ -20,6 +20,7 @@ from adaptive.types import FloatArray
 from lab.soak.fault_plan import FAULT_KINDS
 from lab.soak.machine_load import STALLED_S, MachineLoad
 from lab.soak.verdict.observations import FAST, ROUND_OFF, Intervals, Observations, QuerySecond, SampleSecond
+from service.storage.recorder import ASIDE
 from service.storage.segments import close_left_open, segments
 
 
@@ -370,6 +371,11 @@ MEMORY_KB_PER_HOUR: Final = 1024.0
 RESIDENT_MB: Final = 30.0
 #: Samples that may be on their way when two counters are read: a message or two.
 UNDER_WAY = 64
+#: Counters of the status that add up to the numbers handled, with their signs.
+_NUMBERS: Final = {
+    "samples.received": 1, "samples.thinned": -1, "samples.dropped": -1,
+    "samples.late": -1, "samples.lost": 1, "samples.left_out": 1,
+}  # fmt: skip
 
 
 def judge(observed: Observations, missing: int | None, tracking_pct: float = TRACKING_PCT) -> dict[str, Invariant]:
@@ -483,9 +489,11 @@ def _resident_invariant(grown_mb: float | None, short: str) -> Invariant:
 
 
 def samples_accounted(observed: Observations) -> Invariant:
-    """Between two statuses: numbers handled = samples received - late + lost; received = all verdicts + left out.
+    """Between two statuses: numbers handled = samples handled - late + lost + left out; received = all verdicts +
+    thinned + dropped.
 
-    A learner that cannot keep up leaves samples out and says so: none of them is unaccounted for.
+    A learner that cannot keep up leaves samples out and says so: none of them is unaccounted for. They count as
+    received at once, and as left out when a later sample has been handled, which may be seconds after.
     """
     worst, where = 0.0, ""
     last: dict[str, Mapping[str, float]] = {}
@@ -495,16 +503,12 @@ def samples_accounted(observed: Observations) -> Invariant:
             last.pop(name, None)
             continue
         verdicts = sum(value for key, value in now.items() if key.startswith("samples.gates."))
-        left_out = now.get("samples.thinned", 0)
-        off = {
-            "received and verdicts": abs(now["samples.received"] - verdicts - left_out),
-            "dropped": now.get("samples.dropped", 0),
-        }
+        not_handled = now.get("samples.thinned", 0) + now.get("samples.dropped", 0)
+        off = {"received and verdicts": abs(now["samples.received"] - verdicts - not_handled)}
         before = last.get(name)
         if before is not None and before["samples.restarts"] == now["samples.restarts"] and before["seq"] >= 0:
-            step = {key: now[key] - before[key] for key in ("seq", "samples.received", "samples.late", "samples.lost")}
-            numbers = step["samples.received"] - step["samples.late"] + step["samples.lost"]
-            off["numbers handled"] = abs(step["seq"] - numbers)
+            numbers = sum(sign * (now.get(key, 0) - before.get(key, 0)) for key, sign in _NUMBERS.items())
+            off["numbers handled"] = abs(now["seq"] - before["seq"] - numbers)
         last[name] = now
         for what, difference in off.items():
             if difference > worst:
@@ -517,9 +521,12 @@ def samples_accounted(observed: Observations) -> Invariant:
 
 
 def recorded(folders: list[Path]) -> tuple[Intervals, int]:
-    """The sample numbers in the Parquet segments below ``folders``, and the number of rows."""
+    """The sample numbers in the Parquet segments of the recordings ``folders``, and the number of rows.
+
+    Samples that the axis did not handle count too: they are in a folder of their own below each.
+    """
     found, rows = Intervals(), 0
-    for folder in folders:
+    for folder in (folder for each in folders for folder in (each, each / ASIDE)):
         if not folder.is_dir():
             continue
         # A killed process leaves a segment open; only its end is missing.

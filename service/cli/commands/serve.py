@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from service.cli.options import add_epilog, add_shared
 from service.config.settings import ServeConfig, read_config
 from service.protocol.errors import FieldError
+from service.runtime.descriptors import need_descriptors
 from service.runtime.memory import starting
 from service.runtime.session import check_endpoint, is_loopback
 from service.security.check import has_access_control
@@ -60,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     with starting() as started:
         config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
         config = replace(config, open=config.open or args.open)
+        need_descriptors(len(config.axes) or 1)
         if config.fleet is not None:
             return _run_fleet(config, args, started)
         from service.runtime.stopping import StopSignal

@@ -135,12 +135,12 @@ def locking(descriptor, mode, size):
 fake.locking = locking
 sys.modules["msvcrt"] = fake
 from pathlib import Path
-from service.storage.segments import claim
-first = claim(Path(sys.argv[1]), "lock", "records into")
+from service.storage.owner import FolderOwner
+FolderOwner(Path(sys.argv[1]), "lock", "demo/x").take()
 try:
-    claim(Path(sys.argv[1]), "lock", "records into")
+    FolderOwner(Path(sys.argv[1]), "lock", "demo/x").take()
 except BlockingIOError as error:
-    print('["refused"]' if calls == [(2, 1), (2, 1)] and "records into" in str(error) else error)
+    print('["refused"]' if calls == [(2, 1), (2, 1)] and "demo/x, process" in str(error) else error)
 """
     assert result_of(run_without(("fcntl",), program, str(tmp_path))) == ["refused"]
 

@@ -20,14 +20,14 @@ import pytest
 from service.client.client import Client
 from service.config.settings import read_config
 from service.protocol.query import STALE
-from service.runtime.session import open_service
+from service.runtime.session import open_client, open_service
 from service.server.axis_loading import load_axis
 from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from sim.recordings import read
 from tests.service.conftest import DT_S, make_models, unused_port, write_config
-from tests.service.living import Asker, Process, Stage, eventually
+from tests.service.living import Asker, Process, Stage, eventually, samples
 
 pytestmark = pytest.mark.e2e
 ROOT = Path(__file__).resolve().parents[3]
@@ -176,6 +176,36 @@ def test_killed_while_samples_flow_it_loses_no_record_and_next_to_no_learning(
     missing = np.setdiff1d(np.arange(first), recorded.seq)
     assert np.setdiff1d(missing, under_way).size == 0
     assert last["samples"]["lost"] == missing.size
+
+
+def test_what_waits_at_a_stop_is_recorded_and_learnt_by_the_next_start(
+    tmp_path: Path, processes: list[Process]
+) -> None:
+    """A stop used to learn for two seconds, and what was left went where no start reads it."""
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    serve = ("serve", "--config", str(config))
+    processes.append(Process(*serve))
+    n = 19_000
+    with Client.connect(endpoint, timeout_s=10.0, wait_s=20.0) as client, open_client([endpoint], 20.0) as session:
+        # One message, which the learner needs seconds for.
+        session.put("dehyst/v1/demo/x/sample", samples(0, n // 2))
+        session.put("dehyst/v1/demo/x/sample", samples(n // 2, n - n // 2))
+        eventually(lambda: client.status()["samples"]["waiting"] > 1000)
+    processes[0].send(signal.SIGTERM)
+    begun = time.monotonic()
+    log = processes[0].process.communicate(timeout=60)[1]
+    print(f"stopped after {time.monotonic() - begun:.1f} s")
+    assert processes[0].process.returncode == 0
+    assert "samples still waited; they are in the recording, and the next start learns them" in log
+    recorded = read(tmp_path / "rec")
+    np.testing.assert_array_equal(recorded.seq, np.arange(n))
+    assert not (tmp_path / "rec" / "_aside").exists()
+    processes.append(Process(*serve))
+    with Client.connect(endpoint, timeout_s=10.0, wait_s=20.0) as client:
+        status = client.status()
+        assert status["seq"] == n - 1
+        assert status["samples"]["received"] == n
 
 
 def late_s() -> float:

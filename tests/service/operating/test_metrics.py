@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
 import json
 import re
 import socket
+import threading
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -16,6 +19,7 @@ import pytest
 from adaptive.errors import InputError
 from lab.cli import main
 from service.cli.commands.status import _check
+from service.operating import metrics
 from service.operating.metrics import page, serve_page
 from service.operating.remote import table
 
@@ -79,6 +83,28 @@ def test_the_page_over_http_and_a_reading_that_fails() -> None:
             urllib.request.urlopen(f"http://127.0.0.1:{port}/other", timeout=10)
         with pytest.raises(InputError, match="cannot listen"), serve_page("127.0.0.1", port, lambda: b""):
             pass
+
+
+def test_connections_that_send_slowly_end_and_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred of them used to leave a hundred threads that never ended."""
+    monkeypatch.setattr(metrics, "REQUEST_S", 1.5, raising=False)
+    before = threading.active_count()
+    with contextlib.ExitStack() as opened, serve_page("127.0.0.1", 0, lambda: page([status()])) as port:
+        slow = [opened.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10)) for _ in range(100)]
+        begun, most = time.monotonic(), 0
+        while time.monotonic() - begun < 3.0:
+            for one in slow:
+                with contextlib.suppress(OSError):  # those that were closed
+                    one.send(b"G")
+            most = max(most, threading.active_count() - before)
+            time.sleep(0.1)
+        assert most <= 1 + 16, "threads at a time"
+        until = time.monotonic() + 10.0
+        while threading.active_count() > before + 1 and time.monotonic() < until:
+            time.sleep(0.05)
+        assert threading.active_count() == before + 1, "threads that stay"
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as reply:
+            assert "dehyst_trust_ratio" in reply.read().decode()
 
 
 @pytest.mark.parametrize(

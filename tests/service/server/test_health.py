@@ -105,6 +105,35 @@ def test_received_is_what_was_learnt_refused_thinned_and_dropped(
     assert samples["lost"] >= 0
 
 
+def test_numbers_handled_add_up_at_every_moment_while_samples_are_left_out(
+    axis_loop: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left out counts at once, its numbers are passed when those before it have been handled."""
+    loop = axis_loop(META, queue_samples=300)
+    monkeypatch.setattr("service.intake.sample_queue.MOST_TOGETHER", 50)
+    now_s = iter(0.1 * k for k in range(10_000))
+    monkeypatch.setattr("service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
+    rng = np.random.default_rng(0)
+    seq = np.arange(4000)
+    # The network loses some, of which no notice must be lost either.
+    seq = seq[(rng.random(seq.size) > 0.02) | (seq < 10)]
+    for number, part in enumerate(np.array_split(seq, 160)):
+        y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * part * DT_S)
+        loop.offer(SampleBatch(part, part * DT_S, (y_um - 1.0) / 11.0, y_um))
+        if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
+            loop.take(item)
+        status = status_of(loop)
+        s = status["samples"]
+        handled = s["received"] - s["thinned"] - s["dropped"]
+        assert status["seq"] + 1 == handled - s["late"] + s["lost"] + s["left_out"]
+        missing = status["seq"] + 1 - int(np.count_nonzero(seq <= status["seq"]))
+        # A number that the network lost beside those left out may be told from them a message later.
+        assert abs(s["lost"] - missing) <= 50
+    assert s["thinned"] > 0
+    assert s["dropped"] > 0
+    assert s["left_out"] > 500
+
+
 def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.0) -> Health:
     health = Health()
     for k in range(seconds):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import json
+import os
 import shutil
 import time
 import tracemalloc
@@ -55,7 +56,7 @@ def test_two_services_with_one_checkpoint_folder_delete_nothing_of_each_other(tm
     counters = second.counters()
     assert counters is not None
     assert counters["degraded"]
-    assert "another process" in counters["error"]
+    assert f"held by demo/x, process {os.getpid()}" in counters["error"]
     assert "checkpoint_failed" in [event["event"] for event in axis.take_events()]
     first.close()
     second.hold(5.0)  # the other one has ended
@@ -124,7 +125,7 @@ def test_a_recording_folder_that_vanishes_is_degraded_and_made_anew(tmp_path: Pa
             seen.append(recorder.counters())
         assert any(counts["degraded"] and "vanished" in counts["error"] for counts in seen)
         assert seen[-1]["errors"] == 1
-        rows = rows_behind(where, 1900)
+        rows = rows_behind(where, 1900, "")
         assert rows is not None
         assert int(rows.seq[-1]) >= 1900
     assert recorder.counters()["lost"] == 0

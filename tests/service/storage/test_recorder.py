@@ -239,7 +239,7 @@ def test_two_recorders_do_not_share_a_directory(tmp_path: Path) -> None:
         with Recorder(config(tmp_path)) as second:
             second.put(*block(0, 10), reason="learnt")
             wait_for(lambda: second.counters()["lost"] == 10)
-            assert "another process records" in second.counters()["error"]
+            assert f"{tmp_path}, held by process {os.getpid()}" in second.counters()["error"]
         # One that had nothing to write leaves the open journal to its owner.
         Recorder(config(tmp_path)).close()
         assert segments(tmp_path) == []
@@ -304,16 +304,16 @@ def test_a_restart_finds_what_came_behind_its_checkpoint_across_segments(tmp_pat
         for start in range(0, 1200, 100):
             recorder.put(*block(start, 100), reason="learnt")
             time.sleep(0.03)
-    behind = recorder_files.rows_behind(tmp_path, 7 + 1100)
+    behind = recorder_files.rows_behind(tmp_path, 7 + 1100, "")
     assert behind is not None
     assert behind.seq.tolist() == list(range(1100, 1200))
-    assert recorder_files.rows_behind(tmp_path, 7 + 1200) is None
-    assert recorder_files.rows_behind(tmp_path, 3) is None
+    assert recorder_files.rows_behind(tmp_path, 7 + 1200, "") is None
+    assert recorder_files.rows_behind(tmp_path, 3, "") is None
     # An instance that took over an older state handles some samples again, and what follows is of its count.
     with Recorder(config(tmp_path), index=1150) as recorder:
         recorder.put(*block(5000, 50), reason="learnt")
         wait_for(lambda: recorder.counters()["written"] == 50)
-        again = recorder_files.rows_behind(tmp_path, 1100)
+        again = recorder_files.rows_behind(tmp_path, 1100, "")
     assert again is not None
     assert again.seq.tolist()[-1] == 5049
 
@@ -378,7 +378,7 @@ def test_what_was_dropped_before_it_was_handled_is_recorded_apart(tmp_path: Path
         wait_for(lambda: recorder.counters()["written"] == 90 and recorder.counters()["aside"] == 60)
         # They count for nothing by which a restart goes on.
         assert recorder.index == axis.sequence.received == 90
-        behind = recorder_files.rows_behind(tmp_path, 60)
+        behind = recorder_files.rows_behind(tmp_path, 60, "")
         assert behind is not None
         assert behind.seq.tolist() == list(range(60, 90))
     handled, dropped = read(tmp_path), read(tmp_path / ASIDE)
