@@ -1,9 +1,9 @@
 """Who owns ``command`` of an axis: one controller at a time, by a lease that ends with it.
 
 A controller holds a liveliness token while it commands. The key of the token says who it is, and carries the
-authenticator where there is a key (docs/protocol.md, "Who commands"). Of several tokens the one with the highest time
-counts. The party that applies the voltages takes those of the owner alone (`CommandGate`); while nobody holds a token
-it takes what comes.
+authenticator where there is a key (docs/protocol.md, "Who commands"). Of several tokens the latest counts, by the clock
+that no leap moves. The party that applies the voltages takes those of the owner alone (`CommandGate`); while nobody
+holds a token it takes what comes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import os
 import re
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from service.security.authenticator import SENDER, STAMP, Authenticator, payload
 
 _LOGGER: Final = logging.getLogger("dehyst.security")
 _KEY: Final = re.compile(
-    r"/owner/([0-9]{1,13})/([0-9a-f]{16})/([0-9]{1,10})/([A-Za-z0-9._-]{1,64})(?:/([0-9a-f]{1,64}))?$"
+    r"/owner/([0-9]{1,13})/([0-9a-f]{16})/([0-9]{1,10})/([A-Za-z0-9._-]{1,64})/([0-9]{1,13})(?:/([0-9a-f]{1,64}))?$"
 )
 #: Longest wait for the tokens that are alive, s; on loopback it takes 0.3 ms.
 _ASK_S: Final = 1.0
@@ -40,27 +41,29 @@ class Holder:
 
     Attributes
     ----------
-    since_ms : Unix time at which it took the token, ms, and above that of all tokens that it knew.
+    order : ms that its host had run when it took the token, and above that of all tokens that it knew.
     sender : of its commands, 16 hexadecimal digits (`service.security.authenticator`). process, host : where it runs.
+    since_unix_ms : when it took the token by the clock on the wall, for people alone.
     """
 
-    since_ms: int
+    order: int
     sender: str
     process: int
     host: str
+    since_unix_ms: int
 
     @property
     def name(self) -> str:
         """The part of the token's key that says who it is."""
-        return f"{self.since_ms}/{self.sender}/{self.process}/{self.host}"
+        return f"{self.order}/{self.sender}/{self.process}/{self.host}/{self.since_unix_ms}"
 
     def __str__(self) -> str:
-        since = datetime.fromtimestamp(self.since_ms / 1e3, UTC)
+        since = datetime.fromtimestamp(self.since_unix_ms / 1e3, UTC)
         return f"process {self.process} on {self.host} since {since:%Y-%m-%d %H:%M:%S} UTC"
 
     def to_json(self) -> dict[str, Any]:
         """For a status."""
-        return {"process": self.process, "host": self.host, "since_unix_s": self.since_ms / 1e3}
+        return {"process": self.process, "host": self.host, "since_unix_s": self.since_unix_ms / 1e3}
 
 
 def tag_of(by: Authenticator, keys: Keys, holder: Holder) -> str:
@@ -73,8 +76,8 @@ def read_token(by: Authenticator, keys: Keys, key: str) -> Holder | None:
     found = _KEY.search(key)
     if found is None:
         return None
-    holder = Holder(int(found[1]), found[2], int(found[3]), found[4])
-    return None if by and found[5] != tag_of(by, keys, holder) else holder
+    holder = Holder(int(found[1]), found[2], int(found[3]), found[4], int(found[5]))
+    return None if by and found[6] != tag_of(by, keys, holder) else holder
 
 
 class Holders:
@@ -130,12 +133,19 @@ class CommandGate(Holders):
         self._receive = receive
         self._last = ("", -1)
         self._warned: Holder | None = None
+        #: Each link of the session has a thread of its own.
+        self._one = threading.Lock()
         self._commands: Any = session.declare_subscriber(keys.command, self._on_command)
 
     def _on_command(self, sample: zenoh.Sample) -> None:
+        with self._one:
+            self._take(sample)
+
+    def _take(self, sample: zenoh.Sample) -> None:
         payload, owner = sample.payload.to_bytes(), self.owner
-        stranger = "" if owner is None else self._stranger(sample, payload, owner)
-        if not stranger:
+        # Without an owner too: what is sent while the token is on its way counts as sent.
+        stranger = self._stranger(sample, payload, owner)
+        if owner is None or not stranger:
             self._receive(payload)
             return
         if owner != self._warned:
@@ -144,7 +154,7 @@ class CommandGate(Holders):
             _LOGGER.warning(f"%s: {detail}", self._keys.command, stranger, owner)
         self.foreign, self.stranger = self.foreign + 1, stranger
 
-    def _stranger(self, sample: zenoh.Sample, payload: bytes, owner: Holder) -> str:
+    def _stranger(self, sample: zenoh.Sample, payload: bytes, owner: Holder | None) -> str:
         """Who sent a command, where that is not the owner; else ""."""
         attached = payload_of(sample.attachment)
         stamp = attached[:STAMP]
@@ -153,7 +163,7 @@ class CommandGate(Holders):
         if not self._by.proves(attached[STAMP:], "put", self._keys.command, stamp, payload):
             return "a controller without the key"
         sender, number = stamp[:SENDER].hex(), int.from_bytes(stamp[SENDER:], "little")
-        if sender != owner.sender:
+        if owner is not None and sender != owner.sender:
             known = (str(holder) for holder in self.alive if holder.sender == sender)
             return next(known, f"controller {sender}, which holds no token")
         if self._last[0] == sender and number <= self._last[1]:
@@ -203,8 +213,9 @@ class CommandLease:
             others = self._others()
             if others and not force:
                 raise self._held(max(others))
-            since_ms = max([round(1e3 * time.time()), *(holder.since_ms + 1 for holder in others)])
-            self._holder = Holder(since_ms, self._by.sender.hex(), os.getpid(), _host())
+            order = max([round(1e3 * time.monotonic()), *(holder.order + 1 for holder in others)])
+            since_unix_ms = round(1e3 * time.time())
+            self._holder = Holder(order, self._by.sender.hex(), os.getpid(), _host(), since_unix_ms)
             tag = tag_of(self._by, self._keys, self._holder)
             self._token = self._session.liveliness().declare_token(self._keys.owner(self._holder.name, tag))
             self._holders = Holders(self._session, self._keys, self._by)

@@ -214,7 +214,7 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
     recorded: list[tuple[bytes, Any]] = []
     with open_client(endpoint, 5.0) as stranger, Client.connect(endpoint, timeout_s=5.0) as client:
         stranger.declare_subscriber(KEYS.command, lambda s: recorded.append((s.payload.to_bytes(), s.attachment)))
-        later = Holder(9_999_999_999_999, "ab" * 8, 1, "elsewhere")
+        later = Holder(9_999_999_999_999, "ab" * 8, 1, "elsewhere", 0)
         tokens = [
             stranger.liveliness().declare_token(KEYS.owner(later.name, tag)) for tag in ("", "00" * 16, "nonsense")
         ]
@@ -272,10 +272,13 @@ def test_without_a_key_two_controllers_of_one_process_are_two(stage: tuple[Stage
         leases[1].undeclare()
 
 
-@given(st.integers(0, 9_999_999_999_999), st.integers(0, 2**32), st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True))
-def test_a_token_says_who_holds_it_and_proves_it(since_ms: int, process: int, host: str) -> None:
+@given(
+    st.integers(0, 9_999_999_999_999), st.integers(0, 2**32), st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True),
+    st.integers(0, 9_999_999_999_999),
+)  # fmt: skip
+def test_a_token_says_who_holds_it_and_proves_it(order: int, process: int, host: str, since_unix_ms: int) -> None:
     ours, theirs = own_authenticator(), Authenticator(os.urandom(16))
-    holder = Holder(since_ms, "0123456789abcdef", process, host)
+    holder = Holder(order, "0123456789abcdef", process, host, since_unix_ms)
     key = KEYS.owner(holder.name, tag_of(ours, KEYS, holder))
     assert read_token(ours, KEYS, key) == holder == read_token(NO_KEY, KEYS, KEYS.owner(holder.name))
     assert str(holder).startswith(f"process {process} on {host} since ")
