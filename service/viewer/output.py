@@ -159,7 +159,7 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     scene = Scene(sink, config.scene)
     parent = multiprocessing.parent_process()
     assert parent is not None
-    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_after, args=(parent,), name="view-end", daemon=True).start()
     while True:
         try:
             batch = batches.get(timeout=1.0)

@@ -78,29 +78,19 @@ def test_a_client_takes_the_answers_that_the_same_rule_leaves_as_they_are(
         known.check(answer_of(*u_V), len(u_V), before_V)
 
 
-class Sent:
-    """A session that keeps what is put."""
-
-    def __init__(self) -> None:
-        self.payloads: list[bytes] = []
-
-    def declare_querier(self, *_: Any, **__: Any) -> Any:
-        return SimpleNamespace(id=None, undeclare=lambda: None)
-
-    def put(self, key: str, payload: bytes, **_: Any) -> None:
-        self.payloads.append(payload)
-
-
 def test_a_command_after_a_gap_does_not_leave_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.client.client.zenoh.SourceInfo", lambda *_: None)
-    session = Sent()
-    client = Client(session, SimpleNamespace(feedforward="f", command="c"))  # type: ignore[arg-type]
+    querier = SimpleNamespace(id=None, undeclare=lambda: None)
+    session: Any = SimpleNamespace(declare_querier=lambda *_, **__: querier)
+    keys: Any = SimpleNamespace(feedforward="f", command="c")
+    client, sent = Client(session, keys), list[bytes]()
     client._queries.known = Known({}, LIMITS, DT_S)
+    client._lease = SimpleNamespace(put=sent.append)  # type: ignore[assignment]
     client.command(0, [5.0])
     client.command(40, [9.0, 9.0])  # it may have risen by 4.1 V meanwhile, but not above 5 V
-    assert np.frombuffer(session.payloads[-1][16:], "<f8").tolist() == [5.0, 5.0]
+    assert np.frombuffer(sent[-1][16:], "<f8").tolist() == [5.0, 5.0]
     client.command(62, [0.0, 0.0])  # 21 sample times after the last voltage
-    np.testing.assert_allclose(np.frombuffer(session.payloads[-1][16:], "<f8"), [2.9, 2.8])
+    np.testing.assert_allclose(np.frombuffer(sent[-1][16:], "<f8"), [2.9, 2.8])
 
 
 def test_a_service_restarted_with_narrower_limits_comes_back_by_a_ramp(tmp_path: Path) -> None:
