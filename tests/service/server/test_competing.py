@@ -210,12 +210,12 @@ def hyper_of(axis: Axis) -> Hyperparameters:
     return data.hyper
 
 
-def retuned_from_7500(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner) -> list[dict[str, Any]]:
-    """Ask at sample 7500, go on to 12500; the events."""
-    give(axis, recorded, 6000, 7500, retuner)
+def retuned_from_7700(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner) -> list[dict[str, Any]]:
+    """Ask at sample 7700, go on to 12500; the events."""
+    give(axis, recorded, 6000, 7700, retuner)
     assert retuner.request({}) == {"started": True, "job": 1}
     assert retuner.request({})["started"] is False
-    for k in range(7500, 12500, 100):
+    for k in range(7700, 12500, 100):
         give(axis, recorded, k, k + 100, retuner)
         wait_for(retuner)
     return axis.take_events()
@@ -237,7 +237,7 @@ def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_sam
 ) -> None:
     axis = tunable(bundle)
     before = hyper_of(axis)
-    events = {event["event"]: event for event in retuned_from_7500(axis, rippled, retuner)}
+    events = {event["event"]: event for event in retuned_from_7700(axis, rippled, retuner)}
     last = retuner.status()["last"]
     assert last["outcome"] == "better", last
     assert last["after_V"] < 0.9 * last["before_V"]
@@ -282,7 +282,7 @@ def test_a_bad_proposal_is_found_out_by_its_trial(
     monkeypatch.setattr("service.background.retuner.start_job", job)
     axis = tunable(bundle)
     before = hyper_of(axis)
-    events = [event["event"] for event in retuned_from_7500(axis, recorded, retuner)]
+    events = [event["event"] for event in retuned_from_7700(axis, recorded, retuner)]
     last = retuner.status()["last"]
     assert last["outcome"] == "worse", last
     assert last["after_V"] > last["before_V"]
