@@ -109,6 +109,7 @@ class ModelWatchConfig:
     insane_share : distance from the identified model, as a share of the voltage range, that no drift explains.
     recover_s : time without trouble, s, after which the newest model is served again.
     mark_s : age, s, from which a model counts as one from before the trouble.
+    unseen_s : time, s, for which a wrong voltage may be too near the commanded one to be told from it.
     last_good_s, ramp_s : times, s, for which the last good model is served, and in which the baseline takes over.
     silent_s : time of refused motion without a sample that is learnt, s, after which that is a trouble.
     revive_s : time, s, after which a failed learner is replaced.
@@ -121,6 +122,7 @@ class ModelWatchConfig:
     insane_share: float = 1.0
     recover_s: float = 0.5
     mark_s: float = 0.5
+    unseen_s: float = 0.1
     last_good_s: float = 60.0
     ramp_s: float = 1.0
     silent_s: float = 2.0
@@ -223,7 +225,10 @@ class ModelWatch:
             if found != self.trouble:
                 if not self.trouble:
                     n["since"] = now
-                if found in _TAUGHT and self._mark is not None:
+                if found == VOLTAGE_DIFFERS and self._mark is not None:
+                    fresh = (now - n["marked"]) * self._dt_s < c.unseen_s
+                    self._good = self._mark if fresh or self._next_mark is None else self._next_mark
+                elif found in _TAUGHT and self._mark is not None:
                     self._good = self._next_mark = self._mark
                 self.trouble = found
         elif self.trouble:
