@@ -77,7 +77,9 @@ class CommandWitness:
             known = known or (float(claim.u_V[k]), float(claim.y_um[k]))
         if known is not None:
             self._differs(seq, u_V, known[0])
-        elif self._doubt:
+        elif self._claims or self._doubt:
+            # What is over is dropped: otherwise each later sample would look through all of it.
+            self._claims = tuple(claim for claim in self._claims if claim.first + claim.u_V.size > seq)
             self._believe()
         return known if self.why else None
 

@@ -51,7 +51,7 @@ def test_the_tenth_wrong_sample_is_named_and_replaced_by_what_was_commanded(lie:
         assert (stood_in is not None) == (i + 1 >= DIFFERS_FROM)
     assert stood_in == pytest.approx((commanded_V(seq), 10.0 * commanded_V(seq)))
     assert f"{commanded_V(seq):.6g} V were commanded" in witness.why
-    # Right samples end it; until then each one is still replaced.
+    # Right samples are taken as they are, and end it.
     for i in range(40, 80):
         seq = BELIEVED + i
         if seq % 5 == 0:
