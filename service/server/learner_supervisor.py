@@ -87,7 +87,7 @@ _WIDEN: Final = {
 }
 #: During these nothing is learnt.
 POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED, VOLTAGE_DIFFERS}) | SENSOR_FAULTS
-#: Samples from before these have their names may have been learnt.
+#: Wrong samples may have been learnt before one of these was named.
 _TAUGHT: Final = POISON - {VOLTAGE_DIFFERS}
 #: Refusals for the values of a sample. A stage at rest, or a sample out of sequence, is no trouble.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
@@ -109,7 +109,7 @@ class ModelWatchConfig:
     insane_share : distance from the identified model, as a share of the voltage range, that no drift explains.
     recover_s : time without trouble, s, after which the newest model is served again.
     mark_s : age, s, from which a model counts as one from before the trouble.
-    unseen_s : time, s, for which a wrong voltage may be too near the commanded one to be told from it.
+    unseen_s : time, s, in which a wrong voltage may still be too near the commanded one to be noticed.
     last_good_s, ramp_s : times, s, for which the last good model is served, and in which the baseline takes over.
     silent_s : time of refused motion without a sample that is learnt, s, after which that is a trouble.
     revive_s : time, s, after which a failed learner is replaced.

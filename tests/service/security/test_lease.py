@@ -27,6 +27,7 @@ from service.runtime.session import SURELY, open_client
 from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
 from service.security.lease import CommandLease, Holder, read_token, tag_of
 from service.stage_node.node import status_key
+from tests.service.living import eventually
 
 pytestmark = pytest.mark.e2e
 
@@ -119,22 +120,23 @@ def said_by(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline()
 
 
-def eventually(true: Callable[[], bool], within_s: float = 15.0) -> float:
-    begin = time.monotonic()
-    while not true():
-        assert time.monotonic() - begin < within_s
-        time.sleep(0.01)
-    return time.monotonic() - begin
+@pytest.fixture
+def first(stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]) -> subprocess.Popen[str]:
+    """A controller that commands 2 V, which the stage applies."""
+    found, endpoint = stage
+    process = start(endpoint, 2.0)
+    assert said_by(process) == "commands\n"
+    eventually(lambda: found.applies(2.0))
+    return process
 
 
 def test_the_second_controller_is_refused_and_the_first_one_named(
-    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+    stage: tuple[Stage, str],
+    first: subprocess.Popen[str],
+    start: Callable[[str, float], subprocess.Popen[str]],
 ) -> None:
     """Before, the stage got the voltages of both, in steps of 4 V."""
     found, endpoint = stage
-    first = start(endpoint, 2.0)
-    assert said_by(first) == "commands\n"
-    eventually(lambda: found.applies(2.0))
     before = len(found.u_V)
     error = said_by(start(endpoint, 6.0))
     assert f"process {first.pid} on {socket.gethostname()} since 2" in error
@@ -154,12 +156,10 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
 
 
 def test_after_kill_9_the_next_one_gets_through(
-    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+    stage: tuple[Stage, str],
+    first: subprocess.Popen[str],
 ) -> None:
     found, endpoint = stage
-    first = start(endpoint, 2.0)
-    assert said_by(first) == "commands\n"
-    eventually(lambda: found.applies(2.0))
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.kill()
         begin = time.monotonic()
@@ -174,11 +174,10 @@ def test_after_kill_9_the_next_one_gets_through(
 
 
 def test_one_that_hangs_loses_the_lease_and_is_told_so_when_it_returns(
-    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+    stage: tuple[Stage, str],
+    first: subprocess.Popen[str],
 ) -> None:
     found, endpoint = stage
-    first = start(endpoint, 2.0)
-    assert said_by(first) == "commands\n"
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.send_signal(signal.SIGSTOP)
         begin = time.monotonic()
@@ -195,11 +194,10 @@ def test_one_that_hangs_loses_the_lease_and_is_told_so_when_it_returns(
 
 
 def test_one_can_be_taken_over_by_force_and_is_told_so(
-    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+    stage: tuple[Stage, str],
+    first: subprocess.Popen[str],
 ) -> None:
     found, endpoint = stage
-    first = start(endpoint, 2.0)
-    assert said_by(first) == "commands\n"
     with Client.connect(endpoint, timeout_s=5.0) as client:
         client.take_command(force=True)
         assert f"process {os.getpid()} on " in said_by(first)
