@@ -23,7 +23,7 @@ from adaptive.online.glitch_or_jump import MOST_BRIDGED
 from adaptive.online.kernel_window import NOWHERE, KernelShare
 from adaptive.online.kernel_window import due as window_due
 from adaptive.online.learner import Judgement
-from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following
+from adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
 from adaptive.smoothing import smooth_one
 from adaptive.types import BoolArray, FloatArray, IntArray
 
@@ -116,11 +116,11 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
         return DOUBT
     gates.watch_voltage(g, sample.u_V)
     _note_taken(g, sample, 1)
-    stuck = gates.watch_reading(g, sample.u_V, sample.y_um, f.span_V)
+    refused = gates.check_repeats(g, sample, f.span_V)
     innovation = (sample.y_um - s.x[b, 0]) / f.range_um
     slope, bend = s.drive_x[b, 1] * c.output_scale[1], s.drive_x[b, 2] * c.output_scale[2]
     known = g.since_start > a.settle and intake.is_known(s.known[b, 0], slope, bend)
-    if stuck or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
+    if refused != "" or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
         return DOUBT
     if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
         return DOUBT
@@ -284,7 +284,7 @@ def _finds_fault(
                 odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
                 if not known:
                     _forget_slopes(follows)
-                fault = fault or (odd and known and r.front.credit > 0) or follows.still >= DOUBTED_STEPS
+                fault = fault or (odd and known and r.front.credit > 0) or follows.still >= STILL_STEPS
             if f.tells and known and r.front.credit > 0:
                 r["confirmed"] = follows.good >= CONFIRMED or r.past_count == 0
             # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.

@@ -32,8 +32,8 @@ RAIL_SLACK = 0.02
 KINK_DECAY, KINK_SHARE = 0.9, 2.0
 #: Samples over which the smoother's prediction errors are averaged; each counts at most this many times the rms.
 INNOVATION_SAMPLES, FAR_RMS = 500, 2.0
-#: The sensor is stuck or at its end where so many readings are equal while the voltage moves by this share of its span
-#: and by this many times the usual prediction error of the smoother: share, multiple, number of readings.
+#: Equal readings are none where so many come while the voltage moves by this share of its span, and by this many times
+#: the usual prediction error of the smoother: share, multiple, number of readings.
 STUCK_SHARE, STUCK_SIGMA, REPEATED = 0.002, 8.0, 4
 #: Sample time up to which ``glitch_share`` is not scaled, s.
 GLITCH_DT_S = 1e-3
@@ -77,7 +77,6 @@ class AdmissionConfig:
     glitch_persistence : a jump is believed after more readings than that at the new level, ...
     doubt_persistence : ... or than that where the sensor was wrong within ``doubt_s``, and for jumps outside
     ``glitch_share`` to ``jump_share`` of the range.
-    undo_s : a jump back within this time undoes a jump.
     max_gap : most missing samples that are bridged; after more, the smoother restarts.
     settle : samples after a (re)start that are not learnt.
     timing_tolerance : relative error of the time step between two samples.
@@ -96,7 +95,6 @@ class AdmissionConfig:
     glitch_persistence: int = 12
     doubt_persistence: int = 16
     doubt_s: float = 10.0
-    undo_s: float = 0.5
     max_gap: int = 5
     settle: int = 50
     timing_tolerance: float = 0.5
@@ -113,7 +111,7 @@ class AdmissionConfig:
         for name in (*positive, "timing_tolerance"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a positive number")
-        for name in ("glitch_persistence", "doubt_persistence", "max_gap", "settle", "doubt_s", "undo_s"):
+        for name in ("glitch_persistence", "doubt_persistence", "max_gap", "settle", "doubt_s"):
             if getattr(self, name) < 0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a number, not negative")
 
@@ -130,7 +128,6 @@ class AdmissionState:
     seq: Annotated[int, Entry("number of the last sample taken, -1 before any", low=-1)] = -1
     t_s: Annotated[float, Entry("its time", "s")] = 0.0
     since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
-    since_jump: Annotated[int, Entry("samples since the smoother was moved to a place that had jumped", low=0)] = 0
     since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
     moved: Annotated[int, Entry("the smoother's count when the stage last left a place", low=0)] = 0
     anchor_um: Annotated[float, Entry("where the stage then was", "µm")] = 0.0
@@ -138,6 +135,7 @@ class AdmissionState:
     u_before_V: Annotated[float, Entry("the voltage before", "V")] = 0.0
     kink_V: Annotated[float, Entry("largest kink of the voltage of late, fading", "V", low=0.0)] = 0.0
     innovation2: Annotated[float, Entry("mean square error of the smoother's predictions", "ranges²", low=0.0)] = 0.0
+
     y_um: Annotated[float, Entry("the last reading", "µm")] = 0.0
     same: Annotated[int, Entry("how many readings in a row are equal to it", low=0)] = 0
     low_V: Annotated[float, Entry("lowest voltage meanwhile", "V")] = 0.0
@@ -151,21 +149,16 @@ class AdmissionState:
 
     def restart(self) -> None:
         """The smoother starts again."""
-        self.since_start = self.since_jump = self.moved = 0
+        self.since_start = self.moved = 0
 
     @shared
     def step(self) -> None:
         """The smoother makes a step."""
         self.since_start += 1
-        self.since_jump += 1
 
     def note_glitch(self) -> None:
         """The sensor was found to have been wrong until now."""
         self.since_glitch = 0
-
-    def note_jump(self) -> None:
-        """The smoother is moved to another place."""
-        self.since_jump = 0
 
 
 @shared
@@ -233,20 +226,17 @@ def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation:
 
 
 @shared
-def stuck_share(state: AdmissionState) -> float:
-    """Motion of the stage, in ranges, after which equal readings show a stuck sensor."""
-    return max(STUCK_SHARE, STUCK_SIGMA * float(state.innovation2**0.5))
-
-
-@shared
-def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float) -> bool:
-    """Whether the sensor repeats its reading while the voltage moves. Call it with every reading and its voltage."""
-    if y_um != state.y_um:
-        state.y_um, state.same, state.low_V, state.high_V = y_um, 1, u_V, u_V
-        return False
+def check_repeats(state: AdmissionState, sample: Sample, span_V: float) -> str:
+    """Gate of a reading that is the last one again while the voltage moves. Call it with every reading."""
+    u_V = sample.u_V
+    if sample.y_um != state.y_um:
+        state.y_um, state.same, state.low_V, state.high_V = sample.y_um, 1, u_V, u_V
+        return ""
     state.same += 1
     state.low_V, state.high_V = min(state.low_V, u_V), max(state.high_V, u_V)
-    return state.same >= REPEATED and state.high_V - state.low_V > stuck_share(state) * span_V
+    share = max(STUCK_SHARE, STUCK_SIGMA * state.innovation2**0.5)
+    moved = state.high_V - state.low_V > share * span_V
+    return GLITCH if state.same >= REPEATED and moved else ""
 
 
 @shared

@@ -21,8 +21,8 @@ import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.features import FeatureMap
-from adaptive.online.dead_reckoning import SLOPES, Reckoning
-from adaptive.online.gates import REPEATED, AdmissionConfig, EnvelopeConfig
+from adaptive.online.dead_reckoning import Reckoning
+from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from adaptive.online.track import Step
 from adaptive.state import Entry
 from adaptive.types import BoolArray, FloatArray
@@ -34,7 +34,6 @@ from adaptive.types import BoolArray, FloatArray
 #   c/(1 - sum a_i); its standard deviation follows from the covariance of the fit. Ringing of any frequency does not
 #   shift the level: after a shock the level is zero, however large the amplitude.
 # - the same for the ratios r(k)/position(k): a change of the gain.
-# - a straight line with ringing: a drift in progress.
 #
 # The order with the best Bayesian information criterion is used. A level counts as inside or outside of the tolerance
 # only if it is ``SIGMA`` standard deviations away from the limit. Measured error rates: docs/learner.md.
@@ -57,36 +56,33 @@ class Level(NamedTuple):
     ----------
     at, std : level at the last reading and its standard deviation; infinite if there is no level.
     residual : rms of the residual of the fit. order : number of ringing coefficients.
-    rate : change of the level per reading.
     """
 
     at: float
     std: float
     residual: float
     order: int
-    rate: float
 
 
-def level_of(r: FloatArray, noise: float, drifts: bool = False) -> Level:
+def level_of(r: FloatArray, noise: float) -> Level:
     """The level of (n,) distances ``r`` whose readings have the standard deviation ``noise`` (above 0, same unit).
 
-    ``drifts`` : fit a straight line instead of a constant. Fewer than six values have no level.
+    Fewer than six values have no level.
     """
-    out = np.array([math.nan, math.inf, math.inf, 0.0, 0.0])
+    out = np.array([math.nan, math.inf, math.inf, 0.0])
     # Normalised, so that rounding does not depend on the unit.
     size = max(float(np.max(np.abs(r), initial=0.0)), noise)
-    _fit(np.ascontiguousarray(r, dtype=np.float64) / size, noise / size, drifts, out)
-    return Level(float(out[0]) * size, float(out[1]) * size, float(out[2]) * size, int(out[3]), float(out[4]) * size)
+    _fit(np.ascontiguousarray(r, dtype=np.float64) / size, noise / size, out)
+    return Level(float(out[0]) * size, float(out[1]) * size, float(out[2]) * size, int(out[3]))
 
 
 @compiled
-def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  # pragma: no cover - compiled
-    """Fit all orders, keep the best by the information criterion; ``out`` is [level, std, residual, order, rate]."""
+def _fit(r: FloatArray, noise: float, out: FloatArray) -> None:  # pragma: no cover - compiled
+    """Fit all orders, keep the best by the information criterion; ``out`` is [level, std, residual, order]."""
     n = r.shape[0]
     best = math.inf
-    extra = 2 if drifts else 1
     for p in range(ORDERS + 1):
-        rows, k = n - p, p + extra
+        rows, k = n - p, p + 1
         if rows < 2 * k + SPARE:
             break
         X = np.empty((rows, k))
@@ -94,9 +90,6 @@ def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  #
             for j in range(p):
                 X[i, j] = r[p + i - 1 - j]
             X[i, p] = 1.0
-            if drifts:
-                # Zero at the last reading, so that the constant is the level there.
-                X[i, p + 1] = float(i - rows + 1)
         z = r[p:]
         normal = X.T @ X
         ridge = 1e-13 * np.trace(normal)
@@ -107,11 +100,9 @@ def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  #
         error = z - X @ theta
         variance = float(error @ error) / (rows - k)
         remainder, squares = 1.0, 1.0
-        lagged = 0.0
         for j in range(p):
             remainder -= theta[j]
             squares += theta[j] * theta[j]
-            lagged += theta[j] * (j + 1)
         # The noise of the readings enters through every coefficient: no fit can have a smaller residual than this.
         criterion = rows * math.log(variance + 0.3 * noise * noise * squares) + k * math.log(float(rows))
         criterion /= rows
@@ -120,61 +111,21 @@ def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  #
         best = criterion
         out[2], out[3] = math.sqrt(variance), float(p)
         if remainder < NO_LEVEL:
-            out[0], out[1], out[4] = math.nan, math.inf, 0.0
+            out[0], out[1] = math.nan, math.inf
             continue
-        rate = theta[p + 1] / remainder if drifts else 0.0
-        # On a line r(i) = level + rate i, a lag of j readings contributes -rate j a_j to the constant.
-        level = (theta[p] - rate * lagged) / remainder
+        level = theta[p] / remainder
         gradient = np.zeros(k)
         for j in range(p):
             gradient[j] = level / remainder
         gradient[p] = 1.0 / remainder
         spread = float(gradient @ inverse @ gradient)
-        out[0], out[4] = level, rate
+        out[0] = level
         out[1] = math.sqrt(max(variance, noise * noise) * max(spread, 0.0))
-
-
-class Slope(NamedTuple):
-    """Least-squares line y = constant + slope x.
-
-    std : standard deviation of the slope. residual : rms. share : share of the variance of y that the line explains,
-    0 to 1. swing : standard deviation of x.
-    """
-
-    slope: float
-    constant: float
-    std: float
-    residual: float
-    share: float
-    swing: float
-
-
-def slope_of(x: FloatArray, y: FloatArray) -> Slope:
-    """Least-squares line of (n,) values ``y`` over (n,) values ``x``; n at least 3."""
-    n = x.size
-    dx, dy = x - x.mean(), y - y.mean()
-    xx, xy, yy = float(dx @ dx), float(dx @ dy), float(dy @ dy)
-    if n < 3 or not xx > 0.0:
-        return Slope(0.0, float(y.mean()), math.inf, math.sqrt(yy / max(n, 1)), 0.0, 0.0)
-    slope = xy / xx
-    left = max(yy - slope * xy, 0.0)
-    share = slope * xy / yy if yy > 0.0 else 0.0
-    std = math.sqrt(left / (n - 2) / xx)
-    return Slope(slope, float(y.mean() - slope * x.mean()), std, math.sqrt(left / n), share, math.sqrt(xx / n))
-
-
-def correlated(left: FloatArray) -> float:
-    """Factor of the deviation of a slope whose (n,) residuals are smooth, as from ringing or a drift; at least 1.
-
-    Values of an autoregression of first order count for fewer than they are.
-    """
-    alike = min(max(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300), 0.0), 0.99)
-    return math.sqrt((1.0 + alike) / (1.0 - alike))
 
 
 #: Fewest readings in a row at the expected level that end a hold.
 BACK_AGAIN = 2
-#: Most samples without a reading, or with a repeated one, that dead reckoning bridges.
+#: Most samples without a reading that dead reckoning bridges.
 MOST_BRIDGED = 4096
 #: Longest hold of undecided readings, and of ringing about the old level, s; fewest samples for the first.
 UNDECIDED_S, RINGING_S, UNDECIDED_SAMPLES = 0.04, 0.6, 40
@@ -191,17 +142,9 @@ VALUES, SPACING_S = 64, 5e-4
 SPAN_S = 0.008
 #: Number of values in the shorter windows that are tried after the longest.
 WINDOWS = (28, 16)
-#: A reading that repeats for this time, s, while the stage moves is a fault and not a lost sample.
-STUCK_S = 0.1
 #: Time for which readings must be at the expected level, s, and the same within ``UNDECIDED_S`` of ringing: one half
 #: swing lies within the tolerance.
 CALM_S, CALM_RINGING_S = 0.005, 0.01
-#: A drift may begin at no more than this share of its present level. A larger first reading is still allowed if the
-#: drift is at most this many times faster than a change of gain would be from the motion of the stage.
-BEGUN, WITH_STAGE = 0.6, 2.0
-#: Slopes between which readings follow the stage. Travel of the stage from which on the slope is tested, as a share of
-#: the range: for a jump, and for a sensor fault without further waiting.
-FOLLOWING, MOTION_SHARE, SHOWN_SHARE = (0.6, 1.7), 0.004, 0.015
 
 
 class Verdict(Enum):
@@ -222,7 +165,6 @@ class Circumstances(NamedTuple):
     config, envelope : limits. dt_s : sample time. range_um : displacement range of the model.
     noise_um : standard deviation of a reading from the smoother's prediction.
     usual_um : largest distance of an ordinary reading from the prediction.
-    stuck_um : travel of the stage from which on equal readings cannot be a coincidence.
     rest_um : reading of the stage at rest without voltage.
     low_um, high_um : readings at the ends of the identified range.
     trusted : no sensor fault lately.
@@ -234,7 +176,6 @@ class Circumstances(NamedTuple):
     range_um: float
     noise_um: float
     usual_um: float
-    stuck_um: float
     rest_um: float
     low_um: float
     high_um: float
@@ -259,30 +200,16 @@ class Hold:
     slope: Annotated[float, Entry("jumps accepted so far: the expected reading is slope old + shift")] = 1.0
     shift_um: Annotated[float, Entry("the shift of them", "µm", finite=False)] = 0.0
     jumped: Annotated[int, Entry("number of samples at the last of these jumps, 0 for none", low=0)] = 0
-    silent: Annotated[int, Entry("number of samples at the last one without a reading, or stuck", low=0)] = 0
+    silent: Annotated[int, Entry("number of samples at the last one without a reading", low=0)] = 0
     level: Annotated[int, Entry("index of the first reading of the level that `judge` has found", low=0)] = 0
     away_um: Annotated[float, Entry("distance of that level", "µm", finite=False)] = 0.0
     seen_um: Annotated[float, Entry("largest distance from the expected reading", "µm", finite=False)] = 0.0
     good: Annotated[int, Entry("readings in a row at the expected level", low=0)] = 0
     rang: Annotated[int, Entry("number of samples at the last ringing about that level, 0 for never", low=0)] = 0
-    same_um: Annotated[float, Entry("the last reading, NaN before any", "µm", finite=False)] = math.nan
-    same: Annotated[int, Entry("how many readings in a row are equal to it", low=0)] = 0
-    low_um: Annotated[float, Entry("lowest dead-reckoned position during those", "µm", finite=False)] = 0.0
-    high_um: Annotated[float, Entry("highest dead-reckoned position during those", "µm", finite=False)] = 0.0
-
-    @classmethod
-    def after_equal(cls, reckoning: Reckoning, last_um: float, same_um: float, same: int) -> Hold:
-        """A hold after ``same`` readings in a row, before the last one, that are equal to ``same_um``."""
-        return cls(reckoning, last_um, same_um=same_um, same=same, low_um=same_um, high_um=same_um)
 
     def put(self, u_V: float, y_um: float) -> None:
         """Append one sample, and advance dead reckoning."""
         old_um = self.reckoning.advance(u_V)
-        if y_um == self.same_um:
-            self.same += 1
-            self.low_um, self.high_um = min(self.low_um, old_um), max(self.high_um, old_um)
-        elif not math.isnan(y_um):
-            self.same_um, self.same, self.low_um, self.high_um = y_um, 1, old_um, old_um
         self.u_V.append(u_V)
         self.y_um.append(y_um)
         self.old_um.append(old_um)
@@ -309,11 +236,6 @@ class Hold:
         self.shift_um += by_um
 
 
-def _is_stuck(hold: Hold, stuck_um: float) -> bool:
-    """Whether the last readings are equal although the stage has moved: the sensor is stuck."""
-    return hold.same >= REPEATED and hold.high_um - hold.low_um > SLOPES[0] * stuck_um
-
-
 def tolerance_um(now: Circumstances, reckoning: Reckoning) -> float:
     """Largest distance of a good reading from the dead-reckoned position, µm; it grows with the travelled distance."""
     way_um = min(WAY_SHARE * reckoning.way_um, WAY_MOST * now.range_um)
@@ -332,8 +254,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
     away_um = hold.y_um[-1] - hold.expected_um
     if math.isnan(away_um):
         return Verdict.WAIT if n < MOST_BRIDGED else Verdict.LOST
-    stuck = _is_stuck(hold, now.stuck_um)
-    if not stuck and abs(away_um) <= tolerance_um(now, hold.reckoning):
+    if abs(away_um) <= tolerance_um(now, hold.reckoning):
         hold.good += 1
         # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,
         # readings must stay for CALM_S, because a ringing stage passes the expected level again and again.
@@ -342,28 +263,21 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         return Verdict.BACK if hold.good >= enough or n <= 2 else Verdict.WAIT
     hold.good = 0
     hold.seen_um = max(hold.seen_um, abs(away_um))
-    if stuck:
-        hold.silent = n
-        shown = hold.same * now.dt_s >= STUCK_S and hold.high_um - hold.low_um > SHOWN_SHARE * now.range_um
-        return Verdict.LOST if shown or n >= MOST_BRIDGED else Verdict.WAIT
     if hold.reckoning.lost:
-        return Verdict.LOST
-    # Readings that clearly do not follow the stage show a sensor fault; no need to wait.
-    if n * now.dt_s >= SPAN_S and n >= 10 and not _follow(hold, min(n, round(2 * SPAN_S / now.dt_s)), now, SHOWN_SHARE):
         return Verdict.LOST
     stride = max(1, round(SPACING_S / now.dt_s))
     if n % stride == 0:
         found = _level(hold, now, stride)
         if found is not None:
             return found
-    # Samples without a reading, or with a stuck one, do not count: nothing can be decided from them.
+    # Samples without a reading do not count: nothing can be decided from them.
     waited = n - max(hold.jumped, hold.silent)
     if hold.rang and (n - hold.rang) * now.dt_s <= 0.5 * UNDECIDED_S:
         return Verdict.WAIT if waited * now.dt_s < RINGING_S else Verdict.MOTION
     if waited < max(UNDECIDED_SAMPLES, UNDECIDED_S / now.dt_s):
         return Verdict.WAIT
-    small = hold.seen_um <= now.config.glitch_share * now.range_um or _no_further(hold, waited, now, stride)
-    return Verdict.MOTION if small and not hold.taken and _follow(hold, n, now) else Verdict.LOST
+    small = hold.seen_um <= now.config.glitch_share * now.range_um
+    return Verdict.MOTION if small and not hold.taken else Verdict.LOST
 
 
 def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
@@ -385,33 +299,17 @@ def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
             scaled = level_of(r / position * position[-1], noise)
             if scaled.residual <= levels[0].residual:
                 levels.insert(0, scaled)
-        moving = level_of(r, noise, drifts=True)
-        # The line comes last: an inaccurate frame causes slow motion under the ringing, which a line would fit too.
-        level = next((fit for fit in (*levels, moving) if _known(fit, usual_um)), None)
+        level = next((fit for fit in levels if _known(fit, usual_um)), None)
         if level is None:
             continue
         if abs(level.at) + SIGMA * level.std < usual_um:
             # At the old level: ringing, or a glitch of alternating sign. Neither is learnt.
             hold.rang = y.size
             return Verdict.WAIT
-        if level is moving and not _drifts(level, hold, count, now, stride):
-            continue
         if _is_jump(level, hold, count, r, usual_um, now):
             hold.away_um, hold.level = level.at, y.size - count
             return Verdict.JUMP
     return None
-
-
-def _no_further(hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
-    """Whether the level of the last ``count`` readings is known and no further than the model may be wrong.
-
-    The ringing about it may be larger: it is motion.
-    """
-    part = slice(-(count - count % stride), None)
-    away = np.array(hold.y_um[part]) - hold.slope * np.array(hold.old_um[part]) - hold.shift_um
-    level = level_of(_spaced(away[-VALUES * stride :], stride), now.noise_um / math.sqrt(stride))
-    usual_um = tolerance_um(now, hold.reckoning)
-    return _known(level, usual_um) and abs(level.at) - usual_um <= SIGMA * level.std
 
 
 def _spaced(x: FloatArray, stride: int) -> FloatArray:
@@ -424,23 +322,8 @@ def _known(level: Level, usual_um: float) -> bool:
     return level.std <= max(LEVEL_STD * abs(level.at), USUAL_STD * usual_um)
 
 
-def _drifts(level: Level, hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
-    """Whether a moving level can be a drift of the stage: slow enough, and not caused by a stuck sensor."""
-    rate = abs(level.rate) / (stride * now.dt_s)
-    stage_rate = abs(hold.old_um[-1] - hold.old_um[-count]) / (count * now.dt_s)
-    # A drift begins at the old level. Readings that start far from it and then move on are not a drift. An exception is
-    # the step of a changed gain: it grows with the displacement of the stage.
-    displacement_um = max(abs(hold.old_um[-1] - now.rest_um), 0.1 * now.range_um)
-    begun_um = hold.y_um[hold.jumped] - hold.slope * hold.old_um[hold.jumped] - hold.shift_um
-    if abs(begun_um) > BEGUN * abs(level.at) and rate > WITH_STAGE * stage_rate * abs(level.at) / displacement_um:
-        return False
-    follows = slope_of(np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:]))
-    shown = follows.slope - 2.0 * follows.std > 0.5
-    return rate <= now.envelope.drift_per_s * now.range_um and (shown or stage_rate < 0.3 * rate)
-
-
 def _is_jump(level: Level, hold: Hold, count: int, r: FloatArray, usual_um: float, now: Circumstances) -> bool:
-    """Whether a level is a jump: significant, long enough, allowed by the envelope, and with readings that follow."""
+    """Whether a level is a jump: significant, long enough, and allowed by the envelope."""
     away = abs(level.at)
     # Outside of the identified range the model itself may have an error as large as this.
     if not now.low_um <= hold.expected_um <= now.high_um:
@@ -455,21 +338,7 @@ def _is_jump(level: Level, hold: Hold, count: int, r: FloatArray, usual_um: floa
         return False
     readings = np.array(hold.y_um)
     moved = float(np.nanmax(np.abs(readings - hold.last_um))) + hold.reckoning.way_um + now.usual_um
-    # A stuck sensor looks settled over a short window, so all readings since the last jump must follow as well.
-    return away <= moved and _follow(hold, count, now) and _follow(hold, readings.size - hold.jumped, now)
-
-
-def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SHARE) -> bool:
-    """Whether the last ``count`` readings follow the stage. True if it moves by less than ``share`` of the range."""
-    x, y = np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:])
-    good = ~np.isnan(y)
-    x, y = x[good], y[good]
-    if x.size < 6 or np.ptp(x) < max(share * now.range_um, 8.0 * now.noise_um):
-        return True
-    s = slope_of(x, y)
-    std = s.std * correlated(y - s.slope * x - s.constant)
-    low, high = FOLLOWING
-    return not (s.slope + 4.0 * std < low or s.slope - 4.0 * std > high)
+    return away <= moved
 
 
 def jump_after(frame: FeatureMap, at_um: float, away_um: float) -> tuple[float, float]:

@@ -30,14 +30,12 @@ from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slo
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
-from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, STILL_STEPS, Following, Outcome, Trial
+from adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import smoother_of
 from adaptive.state import Entry, restore, save
 from adaptive.types import FloatArray, Sample
 
-#: A jump back differs from the jump by less than this share of it.
-BACK_SHARE = 0.1
 #: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5
 #: Limits of the motion over the smoother's lag, as shares of the motion that the voltage causes by the mean slope;
@@ -95,12 +93,10 @@ class Intake:
     _trial: Annotated[Trial | None, Entry("trial of the sensor")]
     _control: Annotated[Trial | None, Entry("control trial: it judges readings that are trusted")]
     missing: Annotated[MissingMotion | None, Entry("a gap of which the motion is not known yet")]
-    _before: Annotated[FeatureMap | None, Entry("the frame before the last jump")]
     _proven: Annotated[FeatureMap | None, Entry("the frame before the first jump that is not confirmed")]
     _proven_past: Annotated[Past | None, Entry("a place from then")]
     _pasts: Annotated[list[Past], Entry("places in which the readings followed, older first", name="past", most=2)]
     _lost: Annotated[bool, Entry("whether the smoother has to start again")]
-    _jump_um: Annotated[float, Entry("by how much the last jump moved readings", "µm")]
     _calm: Annotated[int, Entry("samples since readings were last held back", low=0)]
     _credit: Annotated[int, Entry("passed control trials; without any the model judges no sensor", high=CREDIT)]
     _until_control: Annotated[int, Entry("samples until the next control trial")]
@@ -132,8 +128,6 @@ class Intake:
         self._hold = None
         self._trial = None
         self._lost = True  # The smoother has to start again.
-        self._before = None  # The frame before the last jump, and by how much it moved readings, µm.
-        self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
         self._proven = None
         self._proven_past = None
@@ -160,11 +154,6 @@ class Intake:
     def _judges(self) -> bool:
         """Whether the model is good enough to judge the sensor."""
         return self._tells and self._credit > 0
-
-    @property
-    def on_probation(self) -> bool:
-        """Whether a jump was taken so recently that it may still be undone."""
-        return self._before is not None and self.gates.since_jump * self.dt_s <= self._admission.undo_s
 
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number."""
@@ -225,6 +214,7 @@ class Intake:
         self._reckoned_seq = sample.seq
         if self._trial is not None:
             return self._try(self._trial, sample, between, refused)
+        refused = refused or admission.check_repeats(gates, sample, self.base.span_V)
         if track is None or self._lost or missing > c.max_gap or ((missing or refused) and track.motion is None):
             if refused:
                 self._lost = True
@@ -234,13 +224,12 @@ class Intake:
             self._keep(track, model, u, nan)
         if refused:
             return self._without_reading(self._keep(track, model, sample.u_V, nan), refused)
-        stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and gates.since_start > c.settle and is_known(self.known[0], *track.rates_now)
         limit = admission.surprise(c, gates, self.base.span_V)
         if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
             self._hold = self._lagging(track, model(), sample.y_um)
-        doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
+        doubtful = known and abs(innovation) > limit
         # Held readings count too, except while they ring: an error that repeats becomes the usual error.
         if self._hold is None or not self._hold.rang:
             admission.watch_innovation(c, gates, innovation)
@@ -393,21 +382,14 @@ class Intake:
 
         ``past`` : or from where it was when the readings had followed the drive, where the last ones are in doubt too.
         """
-        gates = self.gates
         if past and self._pasts and self._judges:
             reckoning = self._from_past(track, model)
             # A place from long ago, over a long way, is no better than readings that may have rung.
             if reckoning.std_um <= PAST_SHARE * self.range_um:
                 return Hold(reckoning, reckoning.y_um)
         motion, u_before_V, past_V, past_um = track.since_motion()
-        # Readings that were repeated before that was noticed are none, nor are they an anchor.
-        repeated = gates.same - 1 if gates.same >= admission.REPEATED else 0
-        track.doubt(repeated)
-        past_um = past_um[: max(past_um.size - repeated, 0)]
         reckoning = Reckoning.begin(self._of_track(track, model), motion, u_before_V, past_V, past_um, track.memory)
         last_um = float(past_um[-1]) if past_um.size else motion[0]
-        if gates.same > 1:
-            return Hold.after_equal(reckoning, last_um, gates.y_um, gates.same - 1)
         return Hold(reckoning, last_um)
 
     def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
@@ -435,7 +417,6 @@ class Intake:
             range_um=self.range_um,
             noise_um=max(gates.innovation2**0.5, c.surprise_share / c.surprise_sigma) * self.range_um,
             usual_um=usual * self.range_um,
-            stuck_um=admission.stuck_share(gates) * self.range_um,
             rest_um=served.offset_um + served.gain * served.y_rest_um,
             low_um=served.offset_um + served.gain * (served.y_min_um - KNOWN * self.range_um),
             high_um=served.offset_um + served.gain * (served.y_max_um + KNOWN * self.range_um),
@@ -470,49 +451,26 @@ class Intake:
     def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
         """The readings have settled at another level: move frame and place.
 
-        No voltage caused this jump, so the hysteresis memory stays. A jump back soon after another one undoes it.
+        No voltage caused this jump, so the hysteresis memory stays. A jump back is another jump.
         """
-        before, f, away_um = self._before, track.served, hold.away_um
-        undone = False
-        level_um = hold.expected_um + away_um
+        f, away_um = track.served, hold.away_um
         slope, shift_um = hypotheses.jump_after(f, hold.expected_um, away_um)
-        if before is not None and self.on_probation:
-            back = before.gain / f.gain
-            back_um = before.offset_um - back * f.offset_um
-            least = min(
-                abs(back * hold.expected_um + back_um - hold.expected_um - away_um), abs(away_um + self._jump_um)
-            )
-            if least <= max(BACK_SHARE * abs(away_um), now.usual_um):
-                slope, shift_um, undone = back, back_um, True
-        frame = before if undone and before is not None else hypotheses.frame_after(f, slope, shift_um)
+        frame = hypotheses.frame_after(f, slope, shift_um)
         if self._envelope.refuses(self.base.features, frame):
             return self._give_up(sample, hold)
-        first = not undone and self._proven is None
+        first = self._proven is None
         if first:
-            self._proven_past = self._clean_past() if self._pasts else Past.of(track)
-        if undone:
-            self._before = None
-            self.gates.note_glitch()
-            self.undone += 1
-            if self._proven == frame:
-                self._proven = self._proven_past = None
-        else:
-            self._before, self._jump_um = f, away_um
-            self._proven = self._proven or f
-            self.jumps += 1
-        self.gates.note_jump()
+            self._proven, self._proven_past = f, self._clean_past() if self._pasts else Past.of(track)
+        self.jumps += 1
         self.missing = None
         track.move(frame, slope, shift_um)
         hold.take(slope, shift_um)
         self._forget()
-        if undone:
-            # The reckoning since then used the wrong frame.
-            hold.shift(level_um - hold.expected_um)
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
             # It rings about the new level: the frame is right, wait for settled readings.
-            return Taken(admission.RINGING, (), away_um, undone, first=first)
+            return Taken(admission.RINGING, (), away_um, first=first)
         self._hold = None
-        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone, first=first)
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, first=first)
 
     # ---- readings on trial
 
@@ -539,19 +497,16 @@ class Intake:
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
         track, proven = self.track, self._proven
         assert track is not None
-        undone, jump = proven is not None, (0.0, 0.0)
+        undone = proven is not None
         if proven is not None:
-            # Unconfirmed jumps are taken back with the readings that they were taken from. Their effect on a reading in
-            # the frame before: y -> slope y + shift.
-            slope = track.served.gain / proven.gain
-            jump = slope, track.served.offset_um - slope * proven.offset_um
+            # Unconfirmed jumps are taken back with the readings that they were taken from.
             reckoning = reckoning.in_frame(proven)
             if self._proven_past is not None:
                 self._proven_past.u_V.extend(() if self._hold is None else self._hold.u_V)
             track.enter(proven)
             self.undone += 1
-        self._hold, self._before, self._proven, self.missing = None, None, None, None
-        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump, by_voltages=not self._judges)
+        self._hold, self._proven, self.missing = None, None, None
+        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), by_voltages=not self._judges)
         self.trials += 1
         self._forget()
         return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
@@ -650,8 +605,6 @@ class Intake:
             or self._control is not None
             or self._proven is not None
             or self._proven_past is not None
-            or self.on_probation
-            or self.stands_still
         )
 
     # ---- what it teaches
@@ -694,12 +647,12 @@ class Intake:
             return
         track.to_base()
         self.missing = None
-        self._before, self._hold, self._proven, self._proven_past = None, None, None, None
+        self._hold, self._proven, self._proven_past = None, None, None
         self.undone += 1
 
     def creep(self, by_um: float) -> None:
-        """The stage has crept by ``by_um``, µm, without a voltage: move the frame unless a jump is still open."""
-        if self.track is not None and not self.on_probation:
+        """The stage has crept by ``by_um``, µm, without a voltage: move the frame."""
+        if self.track is not None:
             self.track.creep(by_um)
 
     def follow(self, pair: Pair, p_V: float, since_s: float) -> bool:
@@ -733,12 +686,6 @@ class Intake:
             self._pasts = [*self._pasts[-1:], Past.of(track)]
         return fault
 
-    @property
-    def stands_still(self) -> bool:
-        """Whether the readings do not move with the voltage at present: it is too early to say that the sensor sticks,
-        and what they show is not learnt meanwhile."""
-        return self.following.still >= DOUBTED_STEPS
-
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0
@@ -771,9 +718,8 @@ class Intake:
 
     def check_state(self, values: dict[str, Any]) -> None:
         """Raise ValueError where a frame has other sizes than the model."""
-        for name in ("_before", "_proven"):
-            if values[name] is not None:
-                values[name].check_like(self.base.features)
+        if values["_proven"] is not None:
+            values["_proven"].check_like(self.base.features)
 
     def go_on_as(self, other: Intake) -> None:
         """Continue from the state of another intake of the same model."""

@@ -232,7 +232,6 @@ class Parts:
     # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
-    jump_mark: Annotated[Mark, Entry("the estimate before the last jump")]
     proven_mark: Annotated[Mark, Entry("the estimate before the first open jump")]
     confirmed: Annotated[tuple[Mark, Mark], Entry("estimates before readings that followed, older first")]
     mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
@@ -262,7 +261,6 @@ class Parts:
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark = self.filter.mark()
         self.next_mark = self.mark
-        self.jump_mark = self.mark
         self.proven_mark = self.mark
         self.confirmed = (self.mark, self.mark)
         self.mark_ages = self.confirmed_ages = (0, 0)
@@ -307,7 +305,7 @@ class Parts:
             self.window.weigh(kernel_V, left_V, self.filter.step_s)
         if said == "burst":
             self.window.expect_change()
-        if self.judgement.valid and not self.intake.on_probation:
+        if self.judgement.valid:
             self.window.let_go(self.config.before_change)
         self.take_rest(pair.u_V, moving=not rest)
         if self.judgement.valid and not rest:
@@ -417,26 +415,19 @@ class Parts:
         self.intake.forget_rates()
         self.filter.go_back(self.first)
         self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
-        self.mark = self.next_mark = self.jump_mark = self.proven_mark = self.filter.mark()
+        self.mark = self.next_mark = self.proven_mark = self.filter.mark()
         self.confirmed = (self.mark, self.mark)
         self.mark_ages = self.confirmed_ages = (self.judgement.judged,) * 2
         self.domain = base.domain.copy()
         self.events["begun_again"] += 1
 
-    def take_jump(self, jump_um: float, fresh: bool, first: bool) -> None:
-        """The frame has moved by ``jump_um``, µm. ``fresh``: not by undoing a jump; ``first``: see ``Taken``."""
+    def take_jump(self, jump_um: float, first: bool) -> None:
+        """The frame has moved by ``jump_um``, µm; ``first``: see ``Taken``."""
         intake = self.intake
         self.judgement.add_doubt((JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2)
-        if fresh:
-            self.jump_mark = self.filter.mark()
         if first:
-            self.proven_mark = self.jump_mark
+            self.proven_mark = self.filter.mark()
         self.confirmed, self.confirmed_ages = (self.filter.mark(),) * 2, (self.judgement.judged,) * 2
-
-    def undo_jump(self) -> None:
-        """The last jump was none: return to the estimate from before it."""
-        self.filter.restore(self.jump_mark)
-        self.window.keep()
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -450,7 +441,7 @@ class Parts:
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part: now, in all marks, and in the delayed estimates."""
         self.filter.shift_constant(by_V)
-        marks = (self.mark, self.next_mark, self.jump_mark, self.proven_mark, *self.confirmed)
+        marks = (self.mark, self.next_mark, self.proven_mark, *self.confirmed)
         for beta, _ in {id(m): m for m in marks}.values():
             beta[0] += by_V
         self.delay.shift(by_V)
@@ -558,8 +549,7 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     gap = MissingMotion.begin(base, base.rest_memory(y), y, y, 0.0, 1.0, 0.0)
     gap.advance(y)
     gap.correct((y, 0.0, 0.0), 0.0, 1.0)
-    for drifts in (False, True):
-        level_of(np.arange(8.0) % 3.0, 1.0, drifts)
+    level_of(np.arange(8.0) % 3.0, 1.0)
     window.with_hyperparameters(window.hyper).newest_error_V(1)
     for moving in (True, False):
         parts.filter.update(basis, 0.0, moving)
@@ -643,10 +633,8 @@ class Learner:
         taken = intake.take(sample, self.snapshot, parts.judgement.std_V, parts.judgement.recent_V)
         if taken.distrusted:
             self._go_on_without_readings(taken.undone)
-        elif taken.undone:
-            parts.undo_jump()
         if taken.jump_um:
-            parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
+            parts.take_jump(taken.jump_um, taken.first)
             if intake.track is not None and intake.track.features is intake.track.served:
                 parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
         moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
@@ -700,15 +688,13 @@ class Learner:
             return refused
         if self._frozen:
             return admission.FROZEN
-        if intake.stands_still:
-            return admission.UNTRUSTED
         if not parts.follow(self._basis, kernel_V, pair, rest):
             return admission.OUTLIER
         if rest:
             return admission.UNEXCITED
         # The window learns only what the filter has just taken, and what that left. Alone it would take the first
         # samples of a changed stage, which the filter still refuses, and the change would become local for good.
-        if due(pair.now // c.filter_every, c.window_every) and not intake.on_probation:
+        if due(pair.now // c.filter_every, c.window_every):
             return parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)))
         return admission.LEARNT
 

@@ -17,7 +17,7 @@ advances the hysteresis memory. The readings y are compared with the dead-reckon
 - Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. A slope that no stage has:
   ``sensor_gain``. No straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have
   found it. After that the readings must be right for one more window before they are trusted again.
-- A stage at rest only shows whether the reading is the same as before.
+- A stage at rest shows nothing: the trial goes on with its motion.
 
 Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
 While p follows the applied voltage u, no fault is reported. After ``OBEYED`` such windows the readings are trusted,
@@ -37,7 +37,7 @@ import numpy as np
 from adaptive.compiled import shared
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
-from adaptive.online.glitch_or_jump import Circumstances, Slope, correlated, slope_of, tolerance_um
+from adaptive.online.glitch_or_jump import Circumstances, tolerance_um
 from adaptive.state import Entry
 from adaptive.types import FloatArray
 
@@ -66,9 +66,9 @@ FAR_SLOPES, FAR_STRAIGHT = (0.5, 2.0), 0.9
 #: The stage itself drifts if p - u changes at a rate whose standard deviation is below this share of its mean; a step
 #: follows if p differs from u by no more than this share. Forgetting factor of the rate for each step.
 STEADY, FORGET_DRIFT = 0.35, 0.5
-#: A reading stands still if p moves by less than this share of the step of u; numbers of such steps from which nothing
-#: is learnt, and for a fault.
-STEP_STILL, DOUBTED_STEPS, STILL_STEPS = 0.2, 2, 4
+#: A reading stands still if p moves by less than this share of the step of u; number of such steps for a
+#: fault.
+STEP_STILL, STILL_STEPS = 0.2, 4
 #: Good steps in a row after which all readings so far count as confirmed.
 CONFIRMED = 10
 
@@ -187,6 +187,35 @@ def _shows_fault(sums: Following, follows: bool, fastest_V_per_s: float) -> bool
     return sums.count >= ENOUGH_SLOPE or (far and abs(sums.drift_V_per_s) > fastest_V_per_s)
 
 
+class Slope(NamedTuple):
+    """Least-squares line y = constant + slope x.
+
+    std : standard deviation of the slope. residual : rms. share : share of the variance of y that the line explains,
+    0 to 1. swing : standard deviation of x.
+    """
+
+    slope: float
+    constant: float
+    std: float
+    residual: float
+    share: float
+    swing: float
+
+
+def slope_of(x: FloatArray, y: FloatArray) -> Slope:
+    """Least-squares line of (n,) values ``y`` over (n,) values ``x``; n at least 3."""
+    n = x.size
+    dx, dy = x - x.mean(), y - y.mean()
+    xx, xy, yy = float(dx @ dx), float(dx @ dy), float(dy @ dy)
+    if n < 3 or not xx > 0.0:
+        return Slope(0.0, float(y.mean()), math.inf, math.sqrt(yy / max(n, 1)), 0.0, 0.0)
+    slope = xy / xx
+    left = max(yy - slope * xy, 0.0)
+    share = slope * xy / yy if yy > 0.0 else 0.0
+    std = math.sqrt(left / (n - 2) / xx)
+    return Slope(slope, float(y.mean() - slope * x.mean()), std, math.sqrt(left / n), share, math.sqrt(xx / n))
+
+
 # --- The trial of a suspected sensor.
 
 SENSOR_STUCK = "sensor_stuck"
@@ -210,34 +239,21 @@ TELLS, STRAIGHT_ALONE = 2.0, 0.4
 #: Readings that vary by less than this share of the stage's motion stand still.
 STILL = 0.15
 #: Evaluations in a row that must find a fault before it is reported, and before a reported fault is replaced by another
-#: one; windows at rest before a new level is accepted.
-NAMED, RENAMED, RESTED = 3, 24, 3
+#: one.
+NAMED, RENAMED = 3, 24
 #: A slope that differs from 1 by more than this is a change of gain. Two results agree if slopes, and positions as a
 #: share of the range, differ by less than the second value.
 GAIN_STEP, AGREE = 0.02, 0.02
-#: Largest relative difference of slope for which motion confirms a jump that was reverted when the trial began.
-OPEN_SLOPE = 0.15
 #: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
-#: Straight lines in time are taken off position and readings, and what is left must agree. It is compared where that of
-#: the position is at least this multiple of the noise of a reading.
-ALIKE, PLAIN, PLAIN_SLOPE, BENDS_SIGMA = (0.5, 2.5), 0.98, 0.12, 2.0
-#: A drift of the zero beside the motion is accepted after half a window, if position and voltages explain this share of
-#: what is left beside the drift, both slopes are known with this standard deviation, and lie within this factor of 1.
-BESIDE, BESIDE_STD, BESIDE_SLOPE = 0.9, 0.1, 1.4
+ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
 #: The model is wrong if the readings follow for this many windows without two windows that agree on slope and shift.
 UNCLEAR = 6
 #: Number of windows in which p must follow u; smallest share of the variance and largest slope (or its inverse) for
 #: that; the same slope if dead reckoning shows a gain that the envelope does not allow; largest mean of p - u, as a
 #: share of the drive's range, of readings without a change.
 OBEYED, OBEYS, OBEYS_SLOPE, OBEYS_SURE, SAME_SHARE = 2, 0.8, 1.4, 1.2, 0.03
-#: Time over which p and u are compared beside the windows, s; smallest motion of u for that, as a share of the drive's
-#: range. A poor model fails in one window or another, but over seconds its voltages still lie on a line with u. Those
-#: of another stage do not.
-LONG_S, LONG_SWING = 4.0, 0.05
-#: What it costs a model to have named a fault of readings that then follow over ``LONG_S``.
-ACCUSED = 3
 #: Time on trial by voltages alone, s, after which readings that move are trusted: the model is as likely wrong.
 BY_VOLTAGES_S = 2.0
 
@@ -286,7 +302,6 @@ class Trial:
     looked: Annotated[int, Entry("the same at the last evaluation", low=0)] = 0
     suspected: Annotated[str, Entry("the fault of the last evaluation", among=("", *sorted(SENSOR_FAULTS)))] = ""
     times: Annotated[int, Entry("how often in a row it was found", low=0)] = 0
-    rested: Annotated[int, Entry("evaluations in a row at rest with steady readings at a new level", low=0)] = 0
     obeyed: Annotated[int, Entry("evaluations in a row in which p followed the applied voltage")] = 0
     followed: Annotated[int, Entry("evaluations in a row in which the readings followed the position", low=0)] = 0
     agreed: Annotated[int, Entry("those in a row with the same slope and shift", low=0)] = 0
@@ -294,16 +309,7 @@ class Trial:
     returned: Annotated[int, Entry("evaluations in a row, after a fault, that found the readings right", low=0)] = 0
     slope: Annotated[float, Entry("slope of the readings over the position")] = 1.0
     shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
-    open_slope: Annotated[float, Entry("jumps reverted when the trial began, 0 for none")] = 0.0
-    open_shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
-    # They may be of another stage.
-    bent: Annotated[int, Entry("1 if readings that seemed shifted bend otherwise than the position", low=0)] = 0
     by_voltages: Annotated[int, Entry("1 if the position is not believed and voltages are compared", low=0)] = 0
-    mean_u_V: Annotated[float, Entry("mean of u over LONG_S, with forgetting", "V")] = 0.0
-    mean_p_V: Annotated[float, Entry("mean of p", "V")] = 0.0
-    uu: Annotated[float, Entry("mean square deviation of u", "V²", low=0.0)] = 0.0
-    pp: Annotated[float, Entry("mean square deviation of p", "V²", low=0.0)] = 0.0
-    up: Annotated[float, Entry("mean product of the deviations", "V²")] = 0.0
 
     @classmethod
     def begin(
@@ -311,19 +317,13 @@ class Trial:
         reckoning: Reckoning,
         base: LssvmInverse,
         memory: FloatArray,
-        slope: float = 0.0,
-        shift_um: float = 0.0,
         by_voltages: bool = False,
     ) -> Trial:
         """Start a trial. ``memory`` (m,) : of the identified model ``base`` at the start.
 
-        ``slope``, ``shift_um`` : jumps that are reverted now: they mapped a reading y to slope y + shift. 0 for none.
         ``by_voltages`` : judge by the voltages alone.
         """
-        return cls(
-            reckoning, base, memory, np.zeros((4, VALUES)),
-            open_slope=slope, open_shift_um=shift_um, by_voltages=int(by_voltages),
-        )  # fmt: skip
+        return cls(reckoning, base, memory, np.zeros((4, VALUES)), by_voltages=int(by_voltages))
 
     def go_on_from(self, reckoning: Reckoning) -> None:
         """Continue with a better dead-reckoned position of the same instant."""
@@ -339,7 +339,6 @@ class Trial:
             p_V = self.base.evaluate_point(y_um, 0.0, 0.0, self.memory)[0]
             self.window[:, self.count % VALUES] = u_V, y_um, position_um, p_V
             self.count += 1
-            self._take_long(u_V, p_V, max(stride * now.dt_s / LONG_S, 1.0 / self.count))
         size = min(VALUES, int(samples / stride))
         # Half a window is enough to detect readings that do not follow.
         if 2 * self.count < size or (self.since - self.looked) * LOOKS < samples:
@@ -348,46 +347,24 @@ class Trial:
         self.looked = self.since
         last = np.arange(self.count - size, self.count) % VALUES
         u, y, x, p = self.window[:, last]
-        if self._obeyed_long(now):
-            decision = Decision(Outcome.SAME, credit=-ACCUSED if self.fault else -1)
-        elif self.by_voltages:
+        if self.by_voltages:
             decision = self._compare_voltages(u, p, full, now)
         else:
             decision = self._evaluate(u, y, x, p, full, now)
         self.returned = self.returned + 1 if self.fault and decision.outcome is not Outcome.OPEN else 0
         return OPEN if self.fault and self.returned <= LOOKS else decision
 
-    def _take_long(self, u_V: float, p_V: float, share: float) -> None:
-        """Take a pair (u, p) into the means over ``LONG_S``, with the weight ``share``."""
-        du, dp = u_V - self.mean_u_V, p_V - self.mean_p_V
-        self.mean_u_V += share * du
-        self.mean_p_V += share * dp
-        self.uu += share * ((1.0 - share) * du * du - self.uu)
-        self.pp += share * ((1.0 - share) * dp * dp - self.pp)
-        self.up += share * ((1.0 - share) * du * dp - self.up)
-
-    def _obeyed_long(self, now: Circumstances) -> bool:
-        """Whether p follows the applied voltage over ``LONG_S``."""
-        moves = self.uu > (LONG_SWING * drive_V(self.base)) ** 2 and self.pp > 0.0
-        if self.since * now.dt_s < LONG_S or not moves:
-            return False
-        line = Slope(self.up / self.uu, 0.0, 0.0, 0.0, self.up * self.up / (self.uu * self.pp), math.sqrt(self.uu))
-        return self._obeyed_by(line, self.mean_p_V - self.mean_u_V, now)
-
     def _evaluate(
         self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, full: bool, now: Circumstances
     ) -> Decision:
         s = slope_of(x, y)
         if s.swing < max(SWING_SHARE * now.range_um, SWING_SIGMA * now.noise_um):
-            return self._at_rest(x, y, now) if full else OPEN
-        self.rested = 0
+            return OPEN
         voltages, off_V = slope_of(u, p), float(np.mean(p - u))
         drive = drive_V(self.base)
         obeyed = self._obeyed_by(voltages, off_V, now)
         straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
         follows = straight and allowed
-        if self.open_slope and not self.fault and self._confirms_reverted_jumps(s, x, y, now):
-            return Decision(Outcome.CHANGED, self.open_slope, self.open_shift_um)
         off_um = float(np.mean(y - x))
         by_model_um = off_V / self.reckoning.mean_slope_V_per_um
         # Dead reckoning and the identified model show the same shift of the readings: the sensor's zero has moved.
@@ -396,14 +373,9 @@ class Trial:
         slope_error = max(abs(s.slope - 1.0), abs(voltages.slope - 1.0))
         usual = zero_moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
         plain = min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE
-        if usual and plain and not self.bent:
+        if usual and plain:
             # A clear shift of usual size, without a fault so far, needs only half a window.
-            self.bent = int(bends_otherwise(x, y, now.noise_um))
-            if not self.bent:
-                return Decision(Outcome.CHANGED, 1.0, off_um)
-        drifted_um = 0.0 if self.fault or follows else self._drifted_um(u, y, x, p, now)
-        if drifted_um:
-            return Decision(Outcome.CHANGED, 1.0, drifted_um)
+            return Decision(Outcome.CHANGED, 1.0, off_um)
         fault = _fault(s, float(np.std(y)), allowed)
         if s.swing < TELLS * self.reckoning.std_um:
             # The dead-reckoned position is less certain than the motion is large: only the voltages can decide.
@@ -451,21 +423,6 @@ class Trial:
         late = self.since * now.dt_s > BY_VOLTAGES_S and not still
         return Decision(Outcome.SAME) if self.obeyed >= LOOKS or late else OPEN
 
-    def _drifted_um(self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, now: Circumstances) -> float:
-        """Shift of the readings by a drift of the zero that has gone on over the window, µm; 0 if there is none."""
-        rate_um, off_um = beside_drift(x, y, now.noise_um)
-        rate_V, off_V = beside_drift(u, p, now.noise_um * abs(self.reckoning.mean_slope_V_per_um))
-        by_model_um = off_V / self.reckoning.mean_slope_V_per_um
-        alike = off_um != 0.0 and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
-        usual = tolerance_um(now, self.reckoning) < abs(off_um) <= now.envelope.jump * now.range_um
-        return off_um if alike and usual and rate_um * rate_V * self.reckoning.mean_slope_V_per_um > 0.0 else 0.0
-
-    def _confirms_reverted_jumps(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> bool:
-        """Whether the readings follow in the frame of the jumps that were reverted when the trial began."""
-        off_um = float(np.mean(y - self.open_slope * x - self.open_shift_um))
-        alike = abs(s.slope / self.open_slope - 1.0) <= OPEN_SLOPE
-        return s.share >= FOLLOWS and alike and abs(off_um) <= tolerance_um(now, self.reckoning)
-
     def _following(self, s: Slope, off_um: float, at_um: float, in_place: bool, now: Circumstances) -> Decision:
         """Decision for readings that follow, with the line ``s`` and the mean distance ``off_um`` at ``at_um``."""
         same_gain = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
@@ -482,18 +439,6 @@ class Trial:
         self.agreed += 1
         return Decision(Outcome.CHANGED, slope, shift_um) if self.agreed >= LOOKS else OPEN
 
-    def _at_rest(self, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
-        """Decision for a stage at rest: readings have returned to the old level, or are steady at a new one nearby."""
-        off, spread = float(np.mean(y - x)), float(np.std(y - x))
-        steady = spread <= max(3.0 * now.noise_um, 0.5 * now.usual_um)
-        if steady and not self.fault and abs(off) <= tolerance_um(now, self.reckoning):
-            return Decision(Outcome.SAME)
-        nearby = steady and not self.fault and abs(off) <= now.envelope.jump * now.range_um
-        self.rested = self.rested + 1 if nearby else 0
-        if self.rested >= RESTED * LOOKS:
-            return Decision(Outcome.CHANGED, 1.0, off)
-        return OPEN
-
     def refuse(self, why: str) -> None:
         """The envelope does not allow the change that the readings show; ``why`` is the reason as text."""
         # A straight line outside of the envelope counts more than agreement with the identified model: start to count
@@ -509,38 +454,6 @@ class Trial:
         self.suspected = fault
         if self.times >= (RENAMED if self.fault else NAMED):
             self.fault, self.why = fault, why
-
-
-def beside_drift(x: FloatArray, y: FloatArray, noise: float) -> tuple[float, float]:
-    """(change over the window, y - x at its end) of a steady drift of (n,) values ``y`` beside a motion ``x``.
-
-    Zeros if the motion does not explain the rest, with a slope near 1. ``noise`` : standard deviation of a value y.
-    """
-    s, std = _of_bends(x, y)
-    known = std <= BESIDE_STD and s.swing > SWING_SIGMA * noise
-    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
-        return 0.0, 0.0
-    off = slope_of(np.linspace(-1.0, 0.0, x.size), y - x)
-    return off.slope, off.constant
-
-
-def bends_otherwise(x: FloatArray, y: FloatArray, noise: float) -> bool:
-    """Whether (n,) values ``y`` bend in time, and not as the motion ``x`` does. ``noise`` : deviation of a value y.
-
-    Over a short time two motions of the same speed are alike; what is left beside their straight lines tells them
-    apart.
-    """
-    s, std = _of_bends(x, y)
-    return s.swing > BENDS_SIGMA * noise and abs(s.slope - 1.0) > PLAIN_SLOPE + 4.0 * std
-
-
-def _of_bends(x: FloatArray, y: FloatArray) -> tuple[Slope, float]:
-    """The line of (n,) values ``y`` over ``x``, both less their straight lines in time, and the slope's deviation."""
-    t = np.linspace(-1.0, 0.0, x.size)
-    over_x, over_y = slope_of(t, x), slope_of(t, y)
-    dx, dy = x - over_x.slope * t - over_x.constant, y - over_y.slope * t - over_y.constant
-    s = slope_of(dx, dy)
-    return s, s.std * correlated(dy - s.slope * dx)
 
 
 def _fault(s: Slope, spread: float, allowed: bool, unit: str = "um") -> tuple[str, str]:

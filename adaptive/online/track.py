@@ -231,11 +231,6 @@ class Track:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""
         self.memory, self.frozen_memory = memory.copy(), self.served.memory_in(self.base, memory)
 
-    def doubt(self, n: int) -> None:
-        """The last ``n`` readings were none: nothing is taught of them."""
-        slots = self.good.shape[0]
-        self.good[np.arange(self.state.count - min(n, slots), self.state.count) % slots] = False
-
     def steps_over_lag(self, y_um: float) -> tuple[float, float]:
         """By how much the voltage, V, and with a next reading ``y_um`` the readings, µm, have moved over the lag."""
         slots, last = self.u_V.shape[0], self.state.count - 1
