@@ -26,7 +26,7 @@ from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, p
 #: Results of a sample, by their number in a fleet.
 OUTCOMES: Final = (LEARNT, PASSED, *REASONS)
 #: Estimates of the filter that an ordinary step keeps, by their row; see `adaptive.online.learner.Parts`.
-MARKS: Final = ("mark", "next_mark", "confirmed0", "confirmed1")
+MARKS: Final = ("mark", "next_mark")
 
 #: Arrays by their name in a learner's state.
 _ARRAYS: Final = {
@@ -45,9 +45,8 @@ _ALIASES: Final = {
 }  # fmt: skip
 #: Samples by outcome, by their names in a learner's state.
 _COUNTERS: Final = tuple(f"counters.{name}" for name in OUTCOMES)
-#: Numbers beside those of a learner. confirmed : whether the last check has confirmed that the readings follow the
-#: drive. The others: see `Rows`.
-_OWN: Final[StateDict] = {"delay_count": 0, "past_count": 0, "past_written": 0, "confirmed": False}
+#: Numbers beside those of a learner; see `Rows`.
+_OWN: Final[StateDict] = {"delay_count": 0, "past_count": 0, "past_written": 0}
 
 
 def _numbers(state: StateDict) -> StateDict:
@@ -228,7 +227,7 @@ class FleetState:
         self._fields = {path: getattr(s, name) for name, path in _ARRAYS.items()}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j, 0], f"{mark}.covariance": s.marks[:, j, 1:]}
-        self._fields |= {"mark_ages": s.ages[:, :2], "confirmed_ages": s.ages[:, 2:]}
+        self._fields |= {"mark_ages": s.ages}
         parts: dict[str, Any] = {
             "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
             "memory": slice(4 + 2 * lag, None),
@@ -250,7 +249,7 @@ class FleetState:
         s.delay[axis, : len(delay)] = delay
         pasts = [j for j in range(2) if f"front.past{j}.u_V" in rest]
         voltages = [np.asarray(rest.pop(f"front.past{j}.u_V")) for j in pasts]
-        row["delay_count"], row["past_count"], row["confirmed"] = len(delay), len(pasts), False
+        row["delay_count"], row["past_count"] = len(delay), len(pasts)
         row["past_written"] = voltages[0].size if pasts else 0
         for j in pasts:
             _take(self._pasts[j], axis, rest)

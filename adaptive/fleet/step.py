@@ -266,7 +266,7 @@ def _finds_fault(
     before = j.fallback
     r.events["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
     fault = j.fallen_s > learner.ROLLBACK_S
-    confirms = places = False
+    confirmed = places = False
     if checks:
         away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
         outside = f.allowed_V > 0.0 and away_V > f.allowed_V
@@ -274,53 +274,30 @@ def _finds_fault(
         r["rail_s"] = learner.time_at_rail(r.rail_s, saturated, config.check_s)
         fault = fault or (outside and r.left_s >= learner.RAIL_S)
         fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
-        if not saturated:
-            r["confirmed"] = False
-            follows = r.front.following
+        if f.tells and not saturated:
+            follows, fastest_V_per_s = r.front.following, config.envelope.drift_per_s * f.drive_V
             known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
-            if f.tells:
-                fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
-                p_V = u - target + dot(h, s.marks[b, 0, 0], p)
-                odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
-                if not known:
-                    _forget_slopes(follows)
-                fault = fault or (odd and known and r.front.credit > 0) or follows.still >= STILL_STEPS
-            if f.tells and known and r.front.credit > 0:
-                r["confirmed"] = follows.good >= CONFIRMED or r.past_count == 0
+            judges = known and r.front.credit > 0
+            p_V = u - target + dot(h, s.marks[b, 0, 0], p)
+            odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
+            if not known:
+                _forget_slopes(follows)
+            fault = fault or (odd and judges) or follows.still >= STILL_STEPS
+            confirmed = judges and (follows.good >= CONFIRMED or r.past_count == 0)
             # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.
-            places = r.confirmed or (
-                f.tells and not (known and r.front.credit > 0) and follows.steps == 0 and follows.still == 0
-            )
-        confirms = r.confirmed
+            places = confirmed or (not judges and follows.steps == 0 and follows.still == 0)
     if fault:
         return True
     if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
         # A good estimate becomes the next mark; see `Parts.judge`.
-        _move_mark(s, b, 1, 0)
-        _mark_now(s, b, 1)
+        s.marks[b, 0], s.ages[b, 0] = s.marks[b, 1], s.ages[b, 1]
+        s.marks[b, 1, 0], s.marks[b, 1, 1:], s.ages[b, 1] = s.beta[b], s.covariance[b], j.judged
         s.known[b, 0], s.known[b, 1] = s.known[b, 1], s.known[b, 2]
-        if s.ages[b, 2] < s.ages[b, 0]:
-            _move_mark(s, b, 0, 2)
-    if confirms:
-        if s.ages[b, 3] >= s.ages[b, 2]:
-            _move_mark(s, b, 3, 2)
-        _mark_now(s, b, 3)
     if places:
-        if r.confirmed:
+        if confirmed:
             _count_again(r.front.following)
         _remember_place(s, b, False)
     return False
-
-
-@compiled
-def _move_mark(s: Rows, b: int, source: int, target: int) -> None:
-    s.marks[b, target], s.ages[b, target] = s.marks[b, source], s.ages[b, source]
-
-
-@compiled
-def _mark_now(s: Rows, b: int, target: int) -> None:
-    s.marks[b, target, 0], s.marks[b, target, 1:] = s.beta[b], s.covariance[b]
-    s.ages[b, target] = s.numbers[b].judgement.judged
 
 
 @compiled

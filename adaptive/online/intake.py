@@ -78,10 +78,7 @@ def lags(gates: AdmissionState, x_um: float, dy_um: float, range_um: float) -> b
 
 
 class Intake:
-    """The intake of a learner; ``base`` is the identified model.
-
-    ``confirmed`` : whether the last check has confirmed that the readings follow the drive.
-    """
+    """The intake of a learner; ``base`` is the identified model."""
 
     gates: Annotated[AdmissionState, Entry("state of the gates")]
     known: Annotated[
@@ -118,7 +115,6 @@ class Intake:
         self._doubt_V = self._recent_V = 0.0
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
-        self.confirmed = False
         self.missing = None
         self._look_every = max(1, round(LOOK_S / self.dt_s))
         self._least_um = LAGS_SHARE * self.range_um
@@ -497,7 +493,6 @@ class Intake:
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
         track, proven = self.track, self._proven
         assert track is not None
-        undone = proven is not None
         if proven is not None:
             # Unconfirmed jumps are taken back with the readings that they were taken from.
             reckoning = reckoning.in_frame(proven)
@@ -509,7 +504,7 @@ class Intake:
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), by_voltages=not self._judges)
         self.trials += 1
         self._forget()
-        return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
+        return Taken(admission.UNTRUSTED, distrusted=True)
 
     def _try(self, trial: Trial, sample: Sample, between: list[float], refused: str) -> Taken:
         """One sample of a sensor on trial, after missing ones with the voltages ``between``, V.
@@ -660,7 +655,7 @@ class Intake:
 
         ``p_V`` : voltage of the last good model for the pair's motion. ``since_s`` : time since the last check, s.
         """
-        track, self.confirmed = self.track, False
+        track = self.track
         assert track is not None
         if not self._tells:
             return False
@@ -678,8 +673,7 @@ class Intake:
             if self.following.moved:
                 self._pasts = [*self._pasts[-1:], Past.of(track)]
             return self.following.still >= STILL_STEPS
-        self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
-        if self.confirmed:
+        if self._hold is None and (self.following.good >= CONFIRMED or not self._pasts):
             if self.following.good >= CONFIRMED:
                 self._proven = self._proven_past = None
             self.following.count_again()

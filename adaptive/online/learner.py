@@ -232,10 +232,7 @@ class Parts:
     # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
-    proven_mark: Annotated[Mark, Entry("the estimate before the first open jump")]
-    confirmed: Annotated[tuple[Mark, Mark], Entry("estimates before readings that followed, older first")]
     mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
-    confirmed_ages: Annotated[tuple[int, int], Entry("errors judged when the confirmed ones were made", "", "2")]
     rail_s: Annotated[float, Entry("time at a limit, off it where negative; see ``watch_rail``", "s")]
     railed: Annotated[bool, Entry("whether the model was given up for that")]
     left_s: Annotated[float, Entry("time outside the envelope, inside where negative; see ``watch_shape``", "s")]
@@ -261,9 +258,7 @@ class Parts:
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark = self.filter.mark()
         self.next_mark = self.mark
-        self.proven_mark = self.mark
-        self.confirmed = (self.mark, self.mark)
-        self.mark_ages = self.confirmed_ages = (0, 0)
+        self.mark_ages = (0, 0)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
@@ -343,10 +338,6 @@ class Parts:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
             self.intake.mark_rates()
             self.mark_ages = (self.mark_ages[1], j.judged)
-            if self.confirmed_ages[0] < self.mark_ages[0]:
-                # Where the stage moves little, nothing is confirmed for long; a good second counts as much.
-                self.confirmed = (self.mark, self.confirmed[1])
-                self.confirmed_ages = (self.mark_ages[0], self.confirmed_ages[1])
 
     def watch_rail(self, saturated: bool) -> None:
         """After ``judge``: return to the identified model where the voltage stays at a limit because of the model.
@@ -389,21 +380,11 @@ class Parts:
             self.intake.reckon_by(self.intake.base)
         return self.alone != before
 
-    def confirm(self) -> None:
-        """The readings follow the drive: the estimate from before them is confirmed."""
-        newer = int(self.confirmed_ages[1] >= self.confirmed_ages[0])
-        self.confirmed = (self.confirmed[newer], self.filter.mark())
-        self.confirmed_ages = (self.confirmed_ages[newer], self.judgement.judged)
-
-    def go_back(self, undone: bool) -> None:
-        """The readings do not follow the drive: return to the last confirmed estimate.
-
-        ``undone``: unconfirmed jumps are taken back too; return to the estimate before the first of them.
-        """
-        self.filter.restore(self.proven_mark if undone else self.confirmed[0])
-        # The newer confirmed estimate is left out: the fault may have moved it already.
-        moves_V = [self.rows @ (self.filter.beta - beta) for beta, _ in (self.mark, self.next_mark)]
-        self.moved_V = max(sqrt(float(np.mean(move_V**2))) for move_V in moves_V)
+    def go_back(self) -> None:
+        """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
+        self.filter.restore(self.mark)
+        move_V = self.rows @ (self.next_mark.beta - self.mark.beta)
+        self.moved_V = sqrt(float(np.mean(move_V**2)))
         self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s
         self.window.keep()
         self.events["distrusts"] += 1
@@ -415,9 +396,7 @@ class Parts:
         self.intake.forget_rates()
         self.filter.go_back(self.first)
         self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
-        self.mark = self.next_mark = self.proven_mark = self.filter.mark()
-        self.confirmed = (self.mark, self.mark)
-        self.mark_ages = self.confirmed_ages = (self.judgement.judged,) * 2
+        self._mark_now()
         self.domain = base.domain.copy()
         self.events["begun_again"] += 1
 
@@ -426,8 +405,12 @@ class Parts:
         intake = self.intake
         self.judgement.add_doubt((JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2)
         if first:
-            self.proven_mark = self.filter.mark()
-        self.confirmed, self.confirmed_ages = (self.filter.mark(),) * 2, (self.judgement.judged,) * 2
+            self._mark_now()
+
+    def _mark_now(self) -> None:
+        """The present estimate is the one to return to."""
+        self.mark = self.next_mark = self.filter.mark()
+        self.mark_ages = (self.judgement.judged,) * 2
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -441,7 +424,7 @@ class Parts:
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part: now, in all marks, and in the delayed estimates."""
         self.filter.shift_constant(by_V)
-        marks = (self.mark, self.next_mark, self.proven_mark, *self.confirmed)
+        marks = (self.mark, self.next_mark)
         for beta, _ in {id(m): m for m in marks}.values():
             beta[0] += by_V
         self.delay.shift(by_V)
@@ -632,12 +615,12 @@ class Learner:
         parts, intake = self.parts, self.parts.intake
         taken = intake.take(sample, self.snapshot, parts.judgement.std_V, parts.judgement.recent_V)
         if taken.distrusted:
-            self._go_on_without_readings(taken.undone)
+            self._go_on_without_readings()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, taken.first)
             if intake.track is not None and intake.track.features is intake.track.served:
                 parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
-        moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
+        moved = taken.jump_um or taken.distrusted or taken.renamed
         # An ordinary sample neither begins nor ends a trial of the sensor.
         if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
             self._cache = None
@@ -718,18 +701,16 @@ class Learner:
         parts.watch_rail(saturated)
         p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
         if saturated or not intake.follow(pair, p_V, parts.check_s):
-            if intake.confirmed:
-                parts.confirm()
             return ""
         taken = intake.distrust(self.snapshot)
         if taken is None:
             return ""
-        self._go_on_without_readings(taken.undone)
+        self._go_on_without_readings()
         return admission.UNTRUSTED
 
-    def _go_on_without_readings(self, undone: bool) -> None:
-        """The readings are on trial from now on. ``undone``: unconfirmed jumps were taken back."""
-        self.parts.go_back(undone)
+    def _go_on_without_readings(self) -> None:
+        """The readings are on trial from now on."""
+        self.parts.go_back()
         self._cache = None
         self.parts.intake.reckon_by(self.snapshot())
 

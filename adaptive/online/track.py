@@ -48,15 +48,13 @@ class Pair(NamedTuple):
 class Taken(NamedTuple):
     """Result of the intake of a sample: the gate that refused it or "", and the steps to make.
 
-    jump_um : move of the frame, µm. first : whether no other unconfirmed jump is open. undone : whether a jump was
-    taken back, so that everything learnt since is to be forgotten. distrusted : whether the readings are on trial from
-    now on; renamed : whether the name of the sensor fault has changed.
+    jump_um : move of the frame, µm. first : whether no other unconfirmed jump is open. distrusted : whether
+    the readings are on trial from now on; renamed : whether the name of the sensor fault has changed.
     """
 
     refused: str
     steps: tuple[Step, ...] = ()
     jump_um: float = 0.0
-    undone: bool = False
     distrusted: bool = False
     renamed: bool = False
     first: bool = False

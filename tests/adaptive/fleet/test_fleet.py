@@ -64,7 +64,8 @@ def samples(n: int) -> tuple[np.ndarray, np.ndarray]:
         y[axis, rng.integers(400, n, 5)] = np.nan
     y[1, n // 3 :] += 4.0
     y[3, 2 * n // 3 :] *= 0.93
-    y[0, n // 4 : n // 4 + 600] = y[0, n // 4]
+    stuck = y[0, n // 4 : n // 4 + 600]
+    stuck[:] = stuck[0] + 0.005 * np.random.default_rng(9).standard_normal(stuck.size)
     return u, y
 
 

@@ -31,7 +31,7 @@ CONFIG = AdmissionConfig(u_min_V=0.0, u_max_V=8.0, y_min_um=-1.0, y_max_um=90.0)
 
 
 def state(**changes: float) -> AdmissionState:
-    made = AdmissionState(seq=10, t_s=0.010, since_start=1000, since_jump=1000)
+    made = AdmissionState(seq=10, t_s=0.010, since_start=1000)
     for name, value in changes.items():
         setattr(made, name, value)
     return made

@@ -483,12 +483,12 @@ def test_what_was_learnt_since_readings_certainly_followed_is_forgotten(
     learner = Learner.from_state(warm[motion, at])
     trials = learner.counters()["trials"]
     for k in range(at, at + 900):
-        confirmed, last = learner.parts.confirmed[0][0].copy(), learner.parts.filter.beta
+        good, last = learner.parts.mark.beta.copy(), learner.parts.filter.beta
         feed(learner, (u, y), k, k + 1)
         if learner.counters()["trials"] > trials:
             break
-    np.testing.assert_array_equal(learner.parts.filter.beta, confirmed)
-    assert not np.array_equal(last, confirmed)
+    np.testing.assert_array_equal(learner.parts.filter.beta, good)
+    assert not np.array_equal(last, good)
     assert learner.counters()["distrusts"] == 1
 
 
@@ -815,8 +815,7 @@ def test_the_identified_model_is_served_once_the_last_estimate_may_have_moved_as
     u, clean = motions["tones"]
     state = dict(warm["tones", at])
     identified_V = float(np.sqrt(np.asarray(state["judgement.frozen_V2"])))
-    for name in ("confirmed0", "confirmed1", "next_mark", "mark"):
-        state[f"{name}.beta"] = np.array(state["confirmed0.beta"], dtype=np.float64)
+    state["mark.beta"] = np.array(state["next_mark.beta"], dtype=np.float64)
     state["mark.beta"][0] += share * identified_V
     state["mark_ages"] = np.array([int(np.asarray(state["judgement.judged"])) - 50] * 2)
     learner = Learner.from_state(state)
