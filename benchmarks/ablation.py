@@ -69,7 +69,7 @@ from numba.core.dispatcher import Dispatcher
 
 import adaptive.online
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
+from adaptive.online import drift, gates, glitch_or_jump, intake, learner
 from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftConfig, RestCreep
 from adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
@@ -387,15 +387,14 @@ def lines_of(code: CodeType, names: Collection[str]) -> frozenset[Place]:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """A loaded module of the project: its functions, what it imports by name (local name -> origin), the names that are
-    read while it is imported, and those that are the default of an argument (function, place from the end, name)."""
+    """A loaded module of the project: its functions, what it imports by name (local name -> origin), and the names
+    that are read while it is imported."""
 
     module: ModuleType
     codes: tuple[CodeType, ...]
     imported: dict[str, tuple[str, str]]
     modules: frozenset[str]
     at_import: frozenset[str]
-    defaults: tuple[tuple[str, int, str], ...]
 
     @classmethod
     def of(cls, module: ModuleType, path: str) -> Loaded:
@@ -410,14 +409,7 @@ class Loaded:
             elif isinstance(node, ast.Import):
                 modules.update(alias.name for alias in node.names)
         codes = tuple(_functions(compile(text, path, "exec")))
-        defaults = tuple(
-            (node.name, i - len(node.args.defaults), default.id)
-            for node in tree.body
-            if isinstance(node, ast.FunctionDef)
-            for i, default in enumerate(node.args.defaults)
-            if isinstance(default, ast.Name)
-        )
-        return cls(module, codes, imported, frozenset(modules), frozenset(_read_at_import(tree)), defaults)
+        return cls(module, codes, imported, frozenset(modules), frozenset(_read_at_import(tree)))
 
 
 def _functions(code: CodeType) -> Iterator[CodeType]:
@@ -437,9 +429,7 @@ def _read_at_import(node: ast.AST) -> Iterator[str]:
         yield node.attr
     parts: Iterable[ast.AST] = ast.iter_child_nodes(node)
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-        # A default that is a name by itself can be replaced: see `shift`.
-        defaults = [d for d in (*node.args.defaults, *node.args.kw_defaults) if d and not isinstance(d, ast.Name)]
-        parts = [*node.decorator_list, *defaults]
+        parts = [*node.decorator_list, *node.args.defaults, *(d for d in node.args.kw_defaults if d)]
     elif isinstance(node, ast.Lambda):
         parts = []
     elif isinstance(node, ast.AnnAssign):
@@ -507,7 +497,6 @@ def readers_of(module: str, name: str) -> Readers:
                 at_import.append(where)
             for code in it.codes:
                 places |= lines_of(code, locals_)
-            places |= {place_of(vars(it.module)[name].__code__) for name, _, local in it.defaults if local in locals_}
             for own, value in vars(it.module).items():
                 compiles = isinstance(value, Dispatcher) and value.py_func.__module__ == where
                 if compiles and lines_of(value.py_func.__code__, locals_):
@@ -522,13 +511,7 @@ def shift(constant: Constant, value: Any) -> None:
     """Give a constant another value in this process, for ever."""
     readers = readers_of(constant.module, constant.name)
     for where, local in readers.names:
-        it = loaded()[where]
-        mock.patch.object(it.module, local, value).start()
-        for function, at, default in it.defaults:
-            if default == local:
-                made = vars(it.module)[function]
-                made.__defaults__ = tuple(value if i == len(made.__defaults__) + at else old
-                                          for i, old in enumerate(made.__defaults__))  # fmt: skip
+        mock.patch.object(loaded()[where].module, local, value).start()
     for where, name in readers.compiled:
         old: Any = vars(loaded()[where].module)[name]
         new = numba.jit(**old.targetoptions)(old.py_func)
@@ -635,15 +618,10 @@ RULES: Final = (
     Rule("only a model with credit judges", ((Intake, "_judges", _always_judges), (Intake, "_check_model", _nothing))),
     Rule("a model judges at all", ((Intake, "_judges", _always(False)), (Intake, "_check_model", _nothing))),
     Rule("readings that lag are held", ((Intake, "_lags", _always(False)),)),
-    Rule("equal readings are held", ((gates, "watch_reading", _always(False)),)),
+    Rule("repeated readings are none", ((gates, "check_repeats", _always("")),)),
     Rule("readings must follow the drive", ((Intake, "follow", _always(False)),)),
-    Rule("nothing is learnt of readings that stand still", ((Intake, "stands_still", _always(False)),)),
     Rule("undecided readings go on trial", ((Intake, "_give_up", _begin_anew),)),
     Rule("jumps move the frame", ((glitch_or_jump, "_is_jump", _always(False)),)),
-    Rule("jumps are undone", ((Intake, "on_probation", _always(False)),)),
-    Rule("ringing about the old level is motion", ((glitch_or_jump, "_no_further", _always(False)),)),
-    Rule("levels may drift", ((glitch_or_jump, "_drifts", _always(False)),)),
-    Rule("held readings must follow the stage", ((glitch_or_jump, "_follow", _always(True)),)),
     Rule("memories after a gap", ((Intake, "_after_gap", _no_missing_motion),)),
     Rule("rest: only the constant is learnt", ((Intake, "rests", _always(False)),)),
     Rule("creep at rest moves the frame", ((RestCreep, "shift_um", _always(0.0)),)),
@@ -654,7 +632,6 @@ RULES: Final = (
     Rule("roll back to a mark", ((learner, "ROLLBACK_S", math.inf),)),
     Rule("validity", ((Judgement, "decide", _always(True)),)),
     Rule("doubt after a jump", ((Judgement, "add_doubt", _nothing),)),
-    Rule("readings that follow confirm the estimate", ((Parts, "confirm", _nothing),)),
     Rule("a sudden change is detected", ((drift, "DEAD_S", math.inf),)),
     Rule("a jump opens the filter", ((Parts, "expect_change", _nothing),)),
     Rule("outliers are refused by the filter", ((drift, "update", _ungated),)),
@@ -667,11 +644,6 @@ RULES: Final = (
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
     Rule("identified model during a trial", ((Parts, "watch_trial", _never_alone),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
-    Rule("trial: voltages over seconds end it", ((sensor_trust.Trial, "_obeyed_long", _always(False)),)),
-    Rule("trial: a drift beside the motion", ((sensor_trust, "beside_drift", _always((0.0, 0.0))),)),
-    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
-    Rule("trial: confirms jumps taken back", ((sensor_trust.Trial, "_confirms_reverted_jumps", _always(False)),)),
-    Rule("trial: decides at rest", ((sensor_trust.Trial, "_at_rest", _always(sensor_trust.OPEN)),)),
 )  # fmt: skip
 
 
