@@ -120,6 +120,9 @@ COMMANDS: Final[dict[str, Command]] = {
     "identify": _command(
         "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
     ),
+    "export": Command(
+        "service.export.command", IDENTIFICATION, "write a model as C, tables and an FMU, for use without the service"
+    ),
     "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
     "replay": _command(
         "replay",

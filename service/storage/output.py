@@ -7,6 +7,7 @@ import errno
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -88,6 +89,8 @@ def clear_output(out: Path, names: Iterable[str] = ()) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass  # a folder that is there may still be read only
         for name in names:
             path = out / name
             if path.is_dir():
