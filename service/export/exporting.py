@@ -50,6 +50,9 @@ class Frozen:
     def __post_init__(self) -> None:
         if isinstance(self.model, ChampionInverse):
             object.__setattr__(self, "model", self.model.served)
+        # It stands in a comment of C: names of recordings come from anybody.
+        line = " ".join(self.origin.split()).replace("/*", "/ *").replace("*/", "* /")
+        object.__setattr__(self, "origin", line)
 
 
 def voltages(

@@ -145,6 +145,12 @@ def test_the_test_beside_it_passes_and_sees_a_wrong_table(name: str, flags: tupl
     assert subprocess.run(["./check", "it_vectors.csv"], cwd=tmp_path, capture_output=True, check=False).returncode == 1
 
 
+@pytest.mark.parametrize("origin", ["a */ int b = c; /*", "a\n#error b", "*/*/", "µm \\\\"])
+def test_no_name_of_a_recording_breaks_out_of_the_comment(origin: str) -> None:
+    run, _ = compiled(Frozen(model_of("linear"), LIMITS, "it", origin))
+    assert np.isfinite(run(*np.zeros((3, 2)))[0]).all()
+
+
 def test_it_refuses_to_be_compiled_with_fast_math() -> None:
     with pytest.raises(subprocess.CalledProcessError):
         compiled(frozen_of("linear"), "-ffast-math")
