@@ -9,8 +9,10 @@ samples then have a version in numpy (`in_numpy`), which gives the same numbers 
 from __future__ import annotations
 
 import functools
+import logging
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -32,7 +34,21 @@ F = TypeVar("F", bound=Callable[..., Any])
 def _jit(function: F, fastmath: bool | set[str]) -> F:
     if not COMPILES:
         return _interpreted(function)
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath=fastmath)(function))
+    jit = functools.partial(numba.njit, nogil=True, fastmath=fastmath)
+    try:
+        return cast(F, jit(cache=True)(function))
+    except RuntimeError:  # numba found no folder to keep the machine code in
+        _warn_that_nothing_is_kept()
+        return cast(F, jit()(function))
+
+
+@functools.cache
+def _warn_that_nothing_is_kept() -> None:
+    logging.getLogger("dehyst").warning(
+        "machine code cannot be kept: got neither %s nor a home that can be written to, expected one of them; every "
+        "start compiles anew, for minutes: set NUMBA_CACHE_DIR to a folder that can be written to",
+        Path(__file__).parent,
+    )
 
 
 def _interpreted(function: F) -> F:

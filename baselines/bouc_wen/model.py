@@ -249,6 +249,11 @@ class BoucWenInverse:
         object.__setattr__(self, "_constants", np.array(constants, dtype=np.float64))
 
     @property
+    def constants(self) -> FloatArray:
+        """(10,) what `run_inverse` takes: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max; read only."""
+        return self._constants
+
+    @property
     def memory_size(self) -> int:
         """2: last voltage and hysteresis, V."""
         return 2

@@ -25,7 +25,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import StandIn
 from service.protocol.query import MAX_PENDING, NEWEST, FeedforwardQuery, Pending, Trajectory
-from service.protocol.samples import MAX_SEQ, check_finite
+from service.protocol.samples import MAX_SEQ, check_finite, column
 
 # --- The hysteresis memory that the service tracks from measured samples, for queries that bring none.
 
@@ -106,7 +106,7 @@ def derivatives(
                 return np.zeros(1)
             slope: FloatArray = np.gradient(of, dt_s, edge_order=2 if n > 2 else 1)
             return slope
-        array = np.atleast_1d(np.asarray(values, dtype=np.float64))
+        array = column(field, values)
         if array.shape != y_um.shape:
             raise FieldError(field, f"shape {array.shape}", f"{y_um.shape}, that of y_um")
         check_finite(field, array)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import importlib
+import io
+import logging
 import os
 import sys
 from collections.abc import Collection, Mapping, Sequence
@@ -120,6 +123,9 @@ COMMANDS: Final[dict[str, Command]] = {
     "identify": _command(
         "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
     ),
+    "export": Command(
+        "service.export.command", IDENTIFICATION, "write a model as C, tables and an FMU, for use without the service"
+    ),
     "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
     "replay": _command(
         "replay",
@@ -146,9 +152,51 @@ COMMANDS: Final[dict[str, Command]] = {
 }
 
 
+#: What a terminal or a pipe may be unable to show, as units have it on a keyboard; all else becomes a question mark.
+_PLAIN: Final = str.maketrans({"µ": "u", "μ": "u", "²": "2", "°": "deg", "–": "-", "…": "..."})
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """Handler of encoding errors: characters that the encoding of an output lacks are spelt."""
+    assert isinstance(error, UnicodeEncodeError)
+    text = error.object[error.start : error.end].translate(_PLAIN)
+    return text.encode("ascii", "replace").decode(), error.end
+
+
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = COMMANDS) -> int:
-    """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 usage error, 130 interrupted."""
+    """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 usage error, 130 interrupted.
+
+    What the system refuses (a full disk, a folder that is read only, a closed pipe) is one line, not a traceback.
+    """
     args = sys.argv[1:] if argv is None else list(argv)
+    codecs.register_error("dehyst-plain", _plain)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="dehyst-plain")
+    try:
+        try:
+            return _run(args, commands)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except OSError as error:
+        _give_up_stdout()
+        logging.getLogger("dehyst").debug("refused by the system", exc_info=True)
+        if not isinstance(error, BrokenPipeError):  # a closed pipe, as of head, wants no more
+            command = next((a for a in args if not a.startswith("-")), "")
+            print(f"dehyst {command}: {too_many(error) or error}", file=sys.stderr)
+        return 1
+
+
+def _give_up_stdout() -> None:
+    """Where standard output takes no more, let the end of the process not try again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(args: list[str], commands: Mapping[str, Command]) -> int:
     # Before numpy is imported: a second BLAS thread now and then makes a solve of 1 ms wait for 65 ms.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
@@ -185,11 +233,6 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
             raise
         print(f"dehyst {parsed.command}: {needed}", file=sys.stderr)
         return 2
-    except OSError as error:
-        if not (said := too_many(error)):
-            raise
-        print(f"dehyst {parsed.command}: {said}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         print(f"dehyst {parsed.command}: interrupted", file=sys.stderr)
         return 130

@@ -44,7 +44,15 @@ from service.protocol.errors import (
 )
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
-from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference, encode_samples
+from service.protocol.samples import (
+    check_finite,
+    check_seq,
+    column,
+    encode_command,
+    encode_reference,
+    encode_samples,
+    number,
+)
 from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
 from service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
 from service.security.lease import CommandGate, CommandLease
@@ -111,7 +119,9 @@ def continued(
     Arguments that are given are kept. With ``begin``, the number of the first sample of the query, ``pending`` replaces
     the memory. Raises InputError if both ``memory`` and ``begin`` are given.
     """
+    u_before_V = number("u_before_V", u_before_V)
     if begin is not None:
+        begin = check_seq("begin", begin)
         if memory is not None:
             raise FieldError("memory", "memory and begin", "one of the two: with begin the service tracks the memory")
         under = pending_before(after, begin)
@@ -487,7 +497,8 @@ class Client:
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
         query = continued(memory, model, u_before_V, after, begin)
-        asked = encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query)
+        one = number("y_um", y_um), number("v_um_per_s", v_um_per_s), number("a_um_per_s2", a_um_per_s2)
+        asked = encode_query(*one, as_of=as_of, **query)
         answer = self._queries.feedforward(asked, wait_s, 1, query["u_before_V"])
         if begin is not None:
             answer = with_pending(answer, query["pending"], begin, np.array([y_um]))
@@ -525,7 +536,7 @@ class Client:
         as_of : answer from the newest snapshot that has seen no sample after this number.
         wait_s : with ``as_of``, longest time to wait until the service has learnt that far, s; then BehindError.
         """
-        y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
+        y = column("y_um", y_um)
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
         asked = encode_query(y, v, a, as_of=as_of, **query)
@@ -541,6 +552,8 @@ class Client:
         is constant and fetched once. "auto" holds all competing models: the learning model alone is faster to evaluate.
         Without ``deltas`` whole snapshots are followed: fewer, larger, and those that queries are answered from.
         """
+        if not isinstance(model, str):
+            raise FieldError("model", repr(model)[:80], "a name, or an empty text for the default")
         status = self._known().status
         name = model or str(status["served"])
 

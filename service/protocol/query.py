@@ -26,6 +26,7 @@ from service.protocol.samples import (
     column,
     decode_name,
     doubles,
+    number,
 )
 
 # --- Binary payload of a feedforward query (docs/protocol.md).
@@ -97,9 +98,9 @@ def encode_query(
     options, m, n = 0, 0, 1
     parts = []
     if memory is not None:
-        vector = np.ascontiguousarray(memory, dtype="<f8")
+        vector = column("memory", memory, least=0)
         options, m = HAS_MEMORY, vector.size
-        parts.append(vector.tobytes())
+        parts.append(vector.astype("<f8", copy=False).tobytes())
     if type(y_um) is float and type(v_um_per_s) is float and type(a_um_per_s2) is float:
         options |= HAS_ACCELERATION
         parts.append(_ONE_POINT.pack(y_um, v_um_per_s, a_um_per_s2))
@@ -111,6 +112,8 @@ def encode_query(
             columns.append(_same_length("a_um_per_s2", a_um_per_s2, n))
             options |= HAS_ACCELERATION
         parts += [values.astype("<f8", copy=False).tobytes() for values in columns]
+    if not isinstance(model, str):
+        raise FieldError("model", repr(model)[:80], "a name, or an empty text for the default")
     name = model.encode()
     if len(name) > MAX_NAME_BYTES:
         raise FieldError("model", f"{len(name)} bytes", f"a name of at most {MAX_NAME_BYTES} bytes")
@@ -120,7 +123,9 @@ def encode_query(
         y, u = column("pending.y_um", pending.y_um), _same_length("pending.u_V", pending.u_V, len(pending.y_um))
         first = _PENDING.pack(check_seq("pending.first", pending.first), y.size)
         under_way = b"".join((first, y.astype("<f8", copy=False).tobytes(), u.astype("<f8", copy=False).tobytes()))
-    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, u_before_V, m, len(name))
+    if not (isinstance(as_of, int | np.integer) and as_of == NEWEST):
+        check_seq("as_of", as_of)
+    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, number("u_before_V", u_before_V), m, len(name))
     return b"".join((head, *parts, name, under_way))
 
 

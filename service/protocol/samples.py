@@ -10,7 +10,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from operator import index
+from typing import Any, Final, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -125,11 +126,15 @@ def check_finite(field: str, values: FloatArray) -> None:
         raise FieldError(f"{field}[{bad}]", float(values[bad]), "a finite number")
 
 
-def check_seq(field: str, seq: int) -> int:
+def check_seq(field: str, seq: SupportsIndex) -> int:
     """``seq`` as int. Raises InputError if it is not a sequence number."""
-    if not 0 <= seq <= MAX_SEQ:
-        raise FieldError(field, seq, "a sequence number from 0 to 2**62")
-    return int(seq)
+    try:
+        checked = index(seq)
+    except TypeError:
+        checked = -1
+    if not 0 <= checked <= MAX_SEQ:
+        raise FieldError(field, repr(seq)[:80], "a sequence number from 0 to 2**62")
+    return checked
 
 
 def check_sizes(m: int, name_bytes: int) -> None:
@@ -153,22 +158,48 @@ def doubles(data: bytes, offset: int, count: int) -> FloatArray:
     return np.frombuffer(data, dtype="<f8", count=count, offset=offset).astype(np.float64)
 
 
-def column(field: str, values: ArrayLike) -> FloatArray:
-    """``values`` as a contiguous (n,) array of doubles. Raises InputError if it is not, or n is out of range."""
+def number(field: str, value: float) -> float:
+    """``value`` as float. Raises InputError for a text, a list and all else that is no number."""
     try:
-        array = np.ascontiguousarray(values, dtype=np.float64)
+        if isinstance(value, str):
+            raise TypeError(value)
+        return float(value)
     except (TypeError, ValueError) as error:
-        raise FieldError(field, repr(values)[:80], "numbers") from error
+        raise FieldError(field, repr(value)[:80], "a number") from error
+
+
+def column(field: str, values: ArrayLike, least: int = 1) -> FloatArray:
+    """``values`` as a contiguous (n,) array of doubles. Raises InputError if it is not, or n is out of range."""
+    array = np.ascontiguousarray(_of_kind(field, values, "biuf", "numbers"), dtype=np.float64)
     if array.ndim > 1:
         raise FieldError(field, f"shape {array.shape}", "one number or a one-dimensional array")
-    if not 1 <= array.size <= MAX_COUNT:
-        raise FieldError(field, f"{array.size} values", f"1 to {MAX_COUNT} values")
+    if not least <= array.size <= MAX_COUNT:
+        raise FieldError(field, f"{array.size} values", f"{least} to {MAX_COUNT} values")
     return array.reshape(-1)
+
+
+def sequence(field: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Sample numbers (n,). Raises InputError where one is not whole."""
+    array = _of_kind(field, values, "iuf", "whole numbers")
+    if array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
+        raise FieldError(field, repr(values)[:80], "whole numbers, one for each sample time")
+    return np.ascontiguousarray(array, dtype=np.int64).reshape(-1)
+
+
+def _of_kind(field: str, values: ArrayLike, kinds: str, expected: str) -> NDArray[Any]:
+    """``values`` as an array of one of the kinds of numpy's types. Texts are no numbers, even where they show some."""
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise FieldError(field, repr(values)[:80], expected) from error
+    if array.dtype.kind not in kinds:
+        raise FieldError(field, repr(values)[:80], expected)
+    return array
 
 
 def encode_samples(seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike) -> bytes:
     """A message of n samples; arguments are numbers or (n,). Raises InputError for unequal lengths or a bad seq."""
-    numbers = np.ascontiguousarray(seq, dtype=np.int64).reshape(-1)
+    numbers = sequence("seq", seq)
     columns = [column("t_s", t_s), column("u_V", u_V), column("y_um", y_um)]
     for name, values in zip(("t_s", "u_V", "y_um"), columns, strict=True):
         if values.size != numbers.size:

@@ -7,6 +7,7 @@ import errno
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -41,9 +42,11 @@ def atomic_write(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk does not say of what
         raise
     _sync_folder(path.parent)
 
@@ -78,7 +81,21 @@ def append_line(path: Path, line: bytes) -> None:
         os.close(handle)
 
 
-# --- Prepares the output folder of a command: it exists, is writable, and holds no results of an earlier run.
+# --- Checks and prepares the output of a command: it is writable, and a folder holds no results of an earlier run.
+
+
+def check_file(option: str, path: Path) -> None:
+    """Raise InputError unless a file ``path`` can be written, before anything is computed for it."""
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{option}: got {path}, expected a file in a folder that can be written to: {error.strerror}; "
+            f"make {path.parent}, or name another"
+        ) from error
 
 
 def clear_output(out: Path, names: Iterable[str] = ()) -> None:
@@ -88,6 +105,8 @@ def clear_output(out: Path, names: Iterable[str] = ()) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass  # a folder that is there may still be read only
         for name in names:
             path = out / name
             if path.is_dir():

@@ -47,6 +47,18 @@ def test_python_on_a_page_is_python_and_calls_what_a_client_has(page: Path) -> N
             assert hasattr(Client, name), f"{page.name}: client.{name}"
 
 
+def test_every_link_leads_to_a_file_of_the_checkout() -> None:
+    """The site moves some pages; who reads them in the checkout follows the same links."""
+    pages = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    dead = [
+        f"{page}: {target}"
+        for page in pages.split()
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)", (ROOT / page).read_text())
+        if "://" not in target and not (ROOT / page).parent.joinpath(target).exists()
+    ]
+    assert not dead
+
+
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="mkdocs is not installed (extra 'docs')")
 def test_the_site_builds_without_a_warning_and_loads_nothing_from_outside(tmp_path: Path) -> None:
     done = subprocess.run(

@@ -5,6 +5,7 @@ use crate::json::{self, Value};
 use std::collections::HashMap;
 
 pub const VERSION: u8 = 1;
+pub const SAMPLES: u8 = 1;
 pub const QUERY: u8 = 4;
 pub const REPLY: u8 = 5;
 pub const MODEL: u8 = 6;
@@ -85,6 +86,28 @@ fn check_sizes(m: u32, b: u32) -> Result<()> {
 
 fn name(data: &[u8]) -> Result<String> {
     String::from_utf8(data.to_vec()).map_err(|error| Error::new("model", error, "a name in UTF-8"))
+}
+
+/// A payload of kind 1, what the service learns from: n sample numbers, times, s, voltages that are applied from these
+/// times on, V, and readings at these times, µm; NaN where there is none.
+pub fn samples(seq: &[i64], t_s: &[f64], u_v: &[f64], y_um: &[f64]) -> Result<Vec<u8>> {
+    let n = seq.len();
+    for (field, values) in [("t_s", t_s), ("u_V", u_v), ("y_um", y_um)] {
+        if values.len() != n {
+            return Err(Error::new(field, format!("{} values", values.len()), format!("{n}, as many as seq")));
+        }
+    }
+    if !(1..=MAX_COUNT as usize).contains(&n) {
+        return Err(Error::new("n", n, format!("1 to {MAX_COUNT} samples")));
+    }
+    if let Some(i) = seq.iter().position(|number| !(0..=MAX_SEQ).contains(number)) {
+        return Err(Error::new(format!("seq[{i}]"), seq[i], "a sequence number from 0 to 2^62"));
+    }
+    let mut out = vec![VERSION, SAMPLES, 0, 0];
+    out.extend((n as u32).to_le_bytes());
+    seq.iter().for_each(|number| out.extend(number.to_le_bytes()));
+    t_s.iter().chain(u_v).chain(y_um).for_each(|value| out.extend(value.to_le_bytes()));
+    Ok(out)
 }
 
 /// Samples that are commanded and not yet seen by the snapshot.

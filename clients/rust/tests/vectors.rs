@@ -1,7 +1,7 @@
 //! The test vectors of docs/protocol/vectors, by queries and by a follower that goes along.
 
 use dehyst::authenticator::{tag, Heard, Question, Sender};
-use dehyst::wire::{Delta, Query, Reply};
+use dehyst::wire::{samples, Delta, Query, Reply};
 use dehyst::{Authenticator, Follower, Limits, Out, Snapshot, Update};
 use std::fs;
 use std::path::PathBuf;
@@ -199,6 +199,23 @@ fn no_damage_of_a_change_panics_or_is_taken() {
             assert_eq!(publisher.fingerprint(), before);
         }
     }
+}
+
+#[test]
+fn samples_are_the_bytes_of_the_vector() {
+    let column = |field: &str| -> Vec<f64> {
+        let of = |row: &&Vec<String>| row[0] == "samples.payload" && row[1] == field;
+        rows("payloads.txt").iter().filter(of).map(|row| row[3].parse().unwrap()).collect()
+    };
+    let seq: Vec<i64> = column("seq").iter().map(|number| *number as i64).collect();
+    let [t_s, u_v, y_um] = ["t_s", "u_V", "y_um"].map(column);
+    assert_eq!(samples(&seq, &t_s, &u_v, &y_um).unwrap(), read("samples.payload"));
+    let refused = |error: dehyst::Result<Vec<u8>>, field: &str| assert_eq!(error.unwrap_err().field, field);
+    refused(samples(&seq, &t_s, &u_v[1..], &y_um), "u_V");
+    refused(samples(&[], &[], &[], &[]), "n");
+    refused(samples(&[0; 65_537], &[0.0; 65_537], &[0.0; 65_537], &[0.0; 65_537]), "n");
+    refused(samples(&[0, -1], &[0.0; 2], &[0.0; 2], &[0.0; 2]), "seq[1]");
+    refused(samples(&[(1 << 62) + 1], &[0.0], &[0.0], &[0.0]), "seq[0]");
 }
 
 #[test]

@@ -58,7 +58,7 @@ def native() -> ctypes.CDLL:
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     port = unused_port()
-    process = ServeProcess(write_config(tmp_path_factory.mktemp("live"), port), port)
+    process = ServeProcess(write_config(tmp_path_factory.mktemp("live"), port, ("x", "y")), port)
     yield process.endpoint
     process.kill()
 
@@ -150,6 +150,42 @@ def test_a_liar_beside_the_service_is_not_believed(native: ctypes.CDLL, endpoint
             entity.undeclare()  # type: ignore[no-untyped-call]
     native.dehyst_link_close(link)
     native.dehyst_close(handle)
+
+
+def test_what_c_sends_is_learnt_and_signed(native: ctypes.CDLL, endpoint: str) -> None:
+    """A batch by one call: the service takes each sample, believes the sender's signature, and learns a new gain."""
+    link = ctypes.c_void_p()
+    native.dehyst_link_open.argtypes = [
+        *[ctypes.c_char_p] * 4, ctypes.c_double, ctypes.POINTER(ctypes.c_void_p),
+    ]  # fmt: skip
+    native.dehyst_samples.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_void_p] * 4]
+    native.dehyst_link_close.argtypes = [ctypes.c_void_p]
+    assert native.dehyst_link_open(endpoint.encode(), b"demo", b"y", None, 5.0, ctypes.byref(link)) == 0
+    with Client.connect(endpoint, axis="y") as client:
+        before = client.point(40.0, model="lssvm_adaptive").u_V
+        k = np.arange(4000)
+        u = 4.0 + 2.5 * np.sin(2 * np.pi * 4e-3 * k) + 0.8 * np.sin(2 * np.pi * 11e-3 * k)
+        for at in range(0, 4000, 50):
+            columns = [k[at : at + 50], k[at : at + 50] * 1e-3, u[at : at + 50], 0.94 * (11.0 * u[at : at + 50] + 1.0)]
+            assert native.dehyst_samples(link, 50, *(c.ctypes.data for c in columns)) == 0, native.dehyst_error()
+            time.sleep(0.01)
+        until = time.monotonic() + 20.0
+        while client.status()["seq"] < 3999 and time.monotonic() < until:
+            time.sleep(0.05)
+        status = client.status()
+        assert (status["seq"], status["samples"]["received"]) == (3999, 4000)
+        assert client.point(40.0, model="lssvm_adaptive").u_V > before + 0.1
+        # Once signed samples came, those of somebody without the key are left out.
+        client._session.put(client.keys.sample, stage_samples(4000, 50, 1.0))
+        time.sleep(0.5)
+        assert client.status()["samples"]["received"] == 4000
+    for n, field in ((0, b"n:"), (70_000, b"n:")):
+        wrong = np.zeros(max(n, 1))
+        assert native.dehyst_samples(link, n, *[wrong.ctypes.data] * 4) == -1
+        assert field in native.dehyst_error()
+    assert native.dehyst_samples(link, 1, None, *[u.ctypes.data] * 3) == -1
+    assert b"seq: got a null pointer" in native.dehyst_error()
+    native.dehyst_link_close(link)
 
 
 def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:

@@ -71,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
     from service.identification.identifying import NAMES, Stretch, identify_all, split_at, thinning
     from service.storage.model_file import BundleMeta, write_bundle
+    from service.storage.output import check_file
     from sim.recordings import check, repaired, require_usable
 
     check_name("--stage", args.stage)
@@ -82,8 +83,10 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--support", args.support, "at least 10 support vectors")
     if args.fit_samples < 1000:
         raise FieldError("--fit-samples", args.fit_samples, "at least 1000 samples")
-    if not args.out.parent.is_dir():
-        raise FieldError("--out", str(args.out), "a file in a folder that exists", f"make {args.out.parent} first")
+    picture = None if args.no_pictures else args.picture or args.out.with_suffix(".png")
+    check_file("--out", args.out)
+    if picture is not None:
+        check_file("--picture", picture)
 
     # Progress and findings go to stderr: with --json, stdout has nothing but JSON.
     say = progress_printer(args.quiet)
@@ -158,11 +161,9 @@ def run(args: argparse.Namespace) -> int:
         },
     )
     write_bundle(args.out, models, meta)
-    picture: Path | None = None
-    if not args.no_pictures:
+    if picture is not None:
         from service.identification.identifying import draw_identification
 
-        picture = args.picture or args.out.with_suffix(".png")
         title = f"{args.data.name}: inverse models, judged on {judged_on}"
         draw_identification(picture, title, train, test, dt_s * every, results, gain)
     summary: dict[str, Any] = {

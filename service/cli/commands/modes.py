@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import InputError
 from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, mapping_from
 from service.protocol.errors import FieldError
@@ -57,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, fit, judge, write. Returns 0."""
     from service.reports.modes import write_modes
+    from service.storage.output import clear_output
     from sim.modal import FitSettings, study
     from sim.modal.reading import read_periodic
 
@@ -73,8 +73,7 @@ def run(args: argparse.Namespace) -> int:
             f"{record.name}: {drives} drives, {record.y_um.shape[1]} outputs, {realisations} realisations of {periods} "
             f"periods of {samples} samples at {1.0 / record.dt_s:.6g} Hz, {record.amplitude_V:.4g} V rms"
         )
-    if args.out.exists() and not args.out.is_dir():
-        raise InputError(f"--out: got the file {args.out}, expected a folder: name another")
+    clear_output(args.out)
     found = study(
         records,
         tests,

@@ -106,6 +106,13 @@ def test_identify_and_replay_run_as_printed(folder: Path) -> None:
         assert "samples scored" in run_as_printed(example, folder)
 
 
+def test_export_runs_as_printed(folder: Path) -> None:
+    if not (folder / "stage.npz").exists():
+        run_as_printed(examples("identify")[0], folder)
+    for example in examples("export")[:2]:
+        assert "demo_x.c: C99" in run_as_printed(example.replace(" --fmu", ""), folder)
+
+
 def test_look_runs_as_printed(folder: Path) -> None:
     """The first example finds two columns in V and asks; the second says which is which."""
     asking, understood = examples("look")
@@ -159,6 +166,8 @@ def test_examples_beside_a_service_run_as_printed(folder: Path, serve: Callable[
     listing, back = examples("rollback")
     assert "checkpoint" in run_as_printed(listing, folder, "--endpoint", service.endpoint)
     assert "rollback from sample" in run_as_printed(back.replace("41", "1"), folder, "--endpoint", service.endpoint)
+    learnt = run_as_printed(examples("export")[2], folder, "--endpoint", service.endpoint)
+    assert "of dehyst/v1/demo/x after sample" in learnt
     run_as_printed(examples("view")[2], folder, "--endpoint", service.endpoint)
     assert (folder / "run.rrd").stat().st_size > 1000
     _, once, check = examples("status")

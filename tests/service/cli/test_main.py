@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import io
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lab.cli import COMMANDS, main
@@ -17,7 +21,7 @@ from service.cli.main import GROUPS, build_parser
 ROOT = Path(__file__).resolve().parents[3]
 DOCUMENTED = """
 identify serve diagnose modes stage query replay status freeze thaw rollback checkpoints select retune ask-diagnosis
-access router view demo rehearse scenarios soak bench reproduce
+access export router view demo rehearse scenarios soak bench reproduce
 """.split()  # noqa: SIM905
 
 
@@ -103,3 +107,66 @@ def test_bash_completes_from_the_script(tmp_path: Path) -> None:
     )
     done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=False)
     assert done.stdout.split() == ["--standby"], done.stderr
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437", "cp932", "ascii"])
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_help_can_be_read_in_any_encoding(command: str, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", out)
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code in (0, None)
+    out.flush()
+    text = out.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+    assert f"usage: dehyst {command}" in text
+    assert "?m" not in text, "a unit that cannot be shown is spelt: um"
+
+
+def run_into(out: object, *words: str) -> tuple[int, str]:
+    """(exit status, what is said on stderr) of a command whose output goes to ``out``."""
+    done = subprocess.run(
+        [sys.executable, "-m", "lab.cli", *words], cwd=ROOT, stdout=out, stderr=subprocess.PIPE, text=True, check=False
+    )  # type: ignore[call-overload]
+    return done.returncode, done.stderr
+
+
+def test_a_full_disk_and_a_closed_pipe_are_no_traceback() -> None:
+    with open("/dev/full", "w") as full:
+        assert run_into(full, "serve", "--example") == (1, "dehyst serve: [Errno 28] No space left on device\n")
+        assert run_into(full, "serve", "--help")[1].count("\n") <= 1
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        assert run_into(writing, "serve", "--example") == (1, "")
+    finally:
+        os.close(writing)
+
+
+@pytest.mark.parametrize("words", [
+    ["identify", "no.csv", "--out", "{folder}"],
+    ["identify", "no.csv", "--out", "/proc/model.npz"],
+    ["identify", "no.csv", "--out", "{folder}/model.npz", "--picture", "/proc/picture.png"],
+], ids=["a folder", "read only", "the picture"])  # fmt: skip
+def test_an_output_that_cannot_be_written_is_refused_before_the_data_are_read(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([word.replace("{folder}", str(tmp_path)) for word in words]) == 2
+    told = capsys.readouterr().err
+    assert "expected a file in a folder that can be written to" in told
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["diagnose", "modes"])
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_computed(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "data.csv"
+    k = np.arange(4000)
+    u_V = 4.0 + 3.0 * np.sin(2.0 * np.pi * k / 400)
+    rows = np.column_stack([k * 1e-3, u_V, 10.0 * u_V + 1.0])
+    np.savetxt(data, rows, delimiter=",", header="t_s,u_V,y_um", comments="", fmt="%.9g")
+    for module, name in (("sim.diagnosis.prepare", "prepare"), ("sim.modal", "study")):
+        monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("it computes"))
+    assert main([command, str(data), "--out", "/proc", *(["--period", "400"] if command == "modes" else [])]) == 2
+    assert "--out: got /proc, expected a folder that can be written to" in capsys.readouterr().err

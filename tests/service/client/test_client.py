@@ -222,6 +222,28 @@ def test_what_is_not_even_sent(client: Client) -> None:
         client.reference(-1, [1.0])
 
 
+@pytest.mark.parametrize("wrong", ["40", None, [1.5], {}], ids=repr)
+def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> None:
+    for field, ask in (
+        ("y_um", lambda: client.point(wrong)),
+        ("v_um_per_s", lambda: client.point(40.0, wrong)),
+        ("u_before_V", lambda: client.point(40.0, u_before_V=wrong)),
+        ("as_of", lambda: client.point(40.0, as_of=wrong)),
+        ("seq", lambda: client.command(wrong, 1.0)),
+        ("seq", lambda: client.reference(wrong, 1.0)),
+    ):
+        with pytest.raises(InputError, match=f"^{field}: got "):
+            ask()
+    if wrong is not None:
+        with pytest.raises(InputError, match=r"^begin: got "):
+            client.point(40.0, begin=wrong)
+        with pytest.raises(InputError, match=r"^model: got "):
+            client.follow(wrong if wrong != "40" else 40)
+    if wrong != [1.5]:
+        with pytest.raises(InputError, match=r"^y_um: got "):
+            client.trajectory(wrong)
+
+
 def test_commands_and_references_arrive(client: Client) -> None:
     got: dict[str, wire.Block] = {}
     session = client._session

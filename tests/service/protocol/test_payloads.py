@@ -7,6 +7,7 @@ import json
 import math
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -293,3 +294,40 @@ def test_names_that_cannot_be_part_of_a_key_are_refused(name: object) -> None:
 @pytest.mark.parametrize("name", ["a", "x_linear", "stage-2", "a" * 64])
 def test_good_names_are_chunks_of_zenoh_too(name: str) -> None:
     assert str(zenoh.KeyExpr(Keys(name, name).feedforward)) == f"dehyst/v1/{name}/{name}/feedforward"
+
+
+@pytest.mark.parametrize("wrong", ["40", None, "a", {}, 1j, [40.0, None], [1, [2, 3]], np.array("x"), ["40"]], ids=repr)
+def test_what_is_no_number_is_refused_by_field_and_never_guessed(wrong: Any) -> None:
+    """Texts that show a number, None, dictionaries, rows of different lengths: one typed message each."""
+    refused: dict[str, Callable[[], object]] = {
+        "y_um": lambda: encode_query(wrong, 0.0),
+        "v_um_per_s": lambda: encode_query(40.0, wrong),
+        "u_before_V": lambda: encode_query(40.0, 0.0, u_before_V=wrong),
+        "seq": lambda: wire.encode_samples(wrong, 0.0, 0.0, 0.0),
+        "u_V": lambda: wire.encode_samples(1, 0.0, wrong, 0.0),
+        "as_of": lambda: encode_query(40.0, 0.0, as_of=wrong),
+    }
+    if wrong is not None:  # for none
+        refused["memory"] = lambda: encode_query(40.0, 0.0, memory=wrong)
+    for field, encode in refused.items():
+        with pytest.raises(InputError, match=f"^{field}: got "):
+            encode()
+    with pytest.raises(InputError, match=r"^seq: got .* expected a sequence number"):
+        wire.encode_command(wrong, 1.0)
+
+
+@pytest.mark.parametrize("seq", [1.5, [1.0, 2.5], np.nan, -1, 2**62 + 1])
+def test_a_sample_number_is_never_rounded(seq: Any) -> None:
+    n = np.size(seq)
+    with pytest.raises(InputError, match="seq: got"):
+        wire.encode_samples(seq, np.zeros(n), np.zeros(n), np.zeros(n))
+    assert wire.decode_samples(wire.encode_samples([1.0, 2.0], np.zeros(2), np.zeros(2), np.zeros(2))).seq.tolist() == [
+        1,
+        2,
+    ]
+
+
+@pytest.mark.parametrize("model", [None, 7, ["linear"]])
+def test_a_model_is_named_by_a_text(model: Any) -> None:
+    with pytest.raises(InputError, match=r"model: got .* expected a name"):
+        encode_query(40.0, 0.0, model=model)

@@ -424,3 +424,11 @@ def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
     with pytest.raises(OSError, match="No such"), atomic_write(tmp_path / "gone" / "a.bin") as file:
         file.write(b"new")
+
+
+def test_a_full_disk_says_of_what_file(tmp_path: Path) -> None:
+    """The system names no file where a write fails."""
+    with pytest.raises(OSError, match=r"No space left .*a\.bin") as full, atomic_write(tmp_path / "a.bin"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert full.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())

@@ -51,7 +51,7 @@ int main(int argc, char **argv) {
     int64_t last = llround(atof(argv[4]) / DT_S), k = 0, first = -1, seq[BATCH];
     double begin_s = -1.0, u_V = 0.0, play = 0.0, t_s[BATCH], u[BATCH], y[BATCH];
     long missing = 0, refused = 0;
-    uint32_t rows = 0;
+    size_t rows = 0;
     printf("ready\n");
     fflush(stdout);
     while (k < last) {
@@ -73,10 +73,7 @@ int main(int argc, char **argv) {
             missing++;
         u[rows++] = u_V, k++;
         if (rows == BATCH || k == last) {
-            uint8_t out[8 + 32 * BATCH] = {1, 1};
-            memcpy(out + 4, &rows, 4), memcpy(out + 8, seq, 8 * rows), memcpy(out + 8 + 8 * rows, t_s, 8 * rows);
-            memcpy(out + 8 + 16 * rows, u, 8 * rows), memcpy(out + 8 + 24 * rows, y, 8 * rows);
-            refused += dehyst_link_send(link, "sample", out, 8 + 32 * rows) != 0;
+            refused += dehyst_samples(link, rows, seq, t_s, u, y) != 0;
             rows = 0;
         }
     }

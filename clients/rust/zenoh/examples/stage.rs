@@ -40,17 +40,6 @@ fn command(data: &[u8]) -> Option<(i64, Vec<f64>)> {
     u_v.iter().all(|u| u.is_finite()).then_some((first, u_v))
 }
 
-/// A payload of kind 1.
-fn samples(rows: &[(i64, f64, f64, f64)]) -> Vec<u8> {
-    let mut out = vec![1, 1, 0, 0];
-    out.extend((rows.len() as u32).to_le_bytes());
-    rows.iter().for_each(|row| out.extend(row.0.to_le_bytes()));
-    rows.iter().for_each(|row| out.extend(row.1.to_le_bytes()));
-    rows.iter().for_each(|row| out.extend(row.2.to_le_bytes()));
-    rows.iter().for_each(|row| out.extend(row.3.to_le_bytes()));
-    out
-}
-
 fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let word = |i: usize, missing: &str| words.get(i).cloned().unwrap_or_else(|| missing.into());
@@ -64,7 +53,8 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let link = Link::open(&options, Some("command"))?;
     println!("ready");
     let (mut piezo, mut planned, mut begin) = (Piezo::default(), BTreeMap::new(), None::<Instant>);
-    let (mut rows, mut missing, mut refused) = (Vec::new(), 0, 0);
+    let (mut seq, mut t_s, mut u_v, mut y) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut missing, mut refused) = (0, 0);
     let mut k = 0;
     while k < last {
         let pause = begin.map_or(Duration::from_millis(50), |begin| {
@@ -88,11 +78,15 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
             Some(u_v) => piezo.apply(u_v),
             None => missing += 1,
         }
-        rows.push((k, k as f64 * DT_S, piezo.u_v, y_um));
+        seq.push(k);
+        t_s.push(k as f64 * DT_S);
+        u_v.push(piezo.u_v);
+        y.push(y_um);
         k += 1;
-        if rows.len() == BATCH || k == last {
-            link.send("sample", samples(&rows))?;
-            rows.clear();
+        if seq.len() == BATCH || k == last {
+            link.samples(&seq, &t_s, &u_v, &y)?;
+            seq.clear();
+            [&mut t_s, &mut u_v, &mut y].into_iter().for_each(Vec::clear);
         }
     }
     println!("{last} samples, {missing} voltages missing, {refused} commands refused");

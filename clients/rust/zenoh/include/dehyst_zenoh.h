@@ -23,6 +23,13 @@ typedef struct dehyst_link dehyst_link;
 int dehyst_link_open(const char *endpoint, const char *stage, const char *axis, const char *receive, double timeout_s,
                      dehyst_link **link);
 
+/* Publish n samples of the stage, 1 to 65536: what the service learns from. seq: their numbers, one for each sample time,
+ * rising; t_s: their times, s; u_V: voltages applied from these times on, V; y_um: readings at these times, um, NaN
+ * where there is none. Signed with the key of the service where there is one. Waits while the wire is full, so that
+ * nothing is dropped. A link may be used by several threads at a time, but numbers have to arrive in order. */
+int dehyst_samples(const dehyst_link *link, size_t n, const int64_t *seq, const double *t_s, const double *u_V,
+                   const double *y_um);
+
 /* Publish a payload. Waits while the wire is full, so that nothing is dropped. */
 int dehyst_link_send(const dehyst_link *link, const char *key, const uint8_t *payload, size_t bytes);
 

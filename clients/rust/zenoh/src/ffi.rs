@@ -57,11 +57,11 @@ unsafe fn link<'a>(link: *const Link) -> dehyst::Result<&'a Link> {
     link.as_ref().ok_or_else(|| Error::new("link", "a null pointer", "an open link"))
 }
 
-unsafe fn bytes<'a>(payload: *const u8, count: usize) -> dehyst::Result<&'a [u8]> {
-    if payload.is_null() {
-        return Err(Error::new("payload", "a null pointer", "bytes"));
+unsafe fn column<'a, T>(values: *const T, n: usize, field: &str) -> dehyst::Result<&'a [T]> {
+    if values.is_null() {
+        return Err(Error::new(field, "a null pointer", format!("{n} values")));
     }
-    Ok(std::slice::from_raw_parts(payload, count))
+    Ok(std::slice::from_raw_parts(values, n))
 }
 
 unsafe fn give(found: &[u8], into: *mut u8, room: usize, count: *mut usize) -> dehyst::Result<()> {
@@ -103,7 +103,24 @@ pub unsafe extern "C" fn dehyst_link_send(
     payload: *const u8,
     count: usize,
 ) -> c_int {
-    guarded(|| link(to)?.send(&text(key, "key")?, bytes(payload, count)?.to_vec()))
+    guarded(|| link(to)?.send(&text(key, "key")?, column(payload, count, "payload")?.to_vec()))
+}
+
+/// # Safety
+/// `to` comes from `dehyst_link_open`; the columns have `n` values each.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_samples(
+    to: *const Link,
+    n: usize,
+    seq: *const i64,
+    t_s: *const f64,
+    u_v: *const f64,
+    y_um: *const f64,
+) -> c_int {
+    guarded(|| {
+        let (seq, t_s) = (column(seq, n, "seq")?, column(t_s, n, "t_s")?);
+        link(to)?.samples(seq, t_s, column(u_v, n, "u_V")?, column(y_um, n, "y_um")?)
+    })
 }
 
 /// # Safety
@@ -138,7 +155,7 @@ pub unsafe extern "C" fn dehyst_link_ask(
     count: *mut usize,
 ) -> c_int {
     guarded(|| {
-        let found = link(to)?.ask(&text(key, "key")?, bytes(query, query_bytes)?)?;
+        let found = link(to)?.ask(&text(key, "key")?, column(query, query_bytes, "query")?)?;
         give(&found, reply, room, count)
     })
 }

@@ -1,7 +1,7 @@
 //! Bytes to and from the keys of an axis, without a model: what a stage, or a controller that asks ahead, needs.
 
 use crate::{base_of, config, failed, random, Asker, Options};
-use dehyst::{Authenticator, Result};
+use dehyst::{wire, Authenticator, Result};
 use std::sync::mpsc::{channel, Receiver};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -52,6 +52,11 @@ impl Link {
         let put = self.asker.session.put(key, payload).congestion_control(CongestionControl::Block);
         let put = if attached.is_empty() { put } else { put.attachment(attached) };
         put.wait().map_err(|error| failed("send", error, "an open session"))
+    }
+
+    /// Publish samples of the stage, which the service learns from; see [`dehyst::wire::samples`].
+    pub fn samples(&self, seq: &[i64], t_s: &[f64], u_v: &[f64], y_um: &[f64]) -> Result<()> {
+        self.send("sample", wire::samples(seq, t_s, u_v, y_um)?)
     }
 
     /// The next payload of the key that is received; none within `wait`.
