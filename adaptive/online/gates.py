@@ -95,7 +95,7 @@ class AdmissionConfig:
     glitch_persistence: int = 12
     doubt_persistence: int = 16
     doubt_s: float = 10.0
-    max_gap: int = 5
+    max_gap: int = 25
     settle: int = 50
     timing_tolerance: float = 0.5
     rest_share: float = 0.002

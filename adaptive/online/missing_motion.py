@@ -2,8 +2,8 @@
 
 After a gap the place is known and the memory is not: it depends on where the stage turned meanwhile. An ensemble of
 memories stands for the possible motions: straight to the new place, or by turning points above and below it, in both
-orders, as far as the stage can go in that time. Their mean is served. The spread of their voltages is added to the
-stated deviation.
+orders, as far as the stage can go in that time with its largest known velocity and acceleration. Their mean is served.
+The spread of their voltages is added to the stated deviation.
 
 Each member then follows the readings, and the voltages correct them all: an ensemble Kalman filter of the memory alone
 (the deterministic one of Whitaker and Hamill, 2002). Plays that the motion wipes out become equal by themselves. The
@@ -84,7 +84,8 @@ class MissingMotion:
         """
         top_um, bottom_um = max(from_um, to_um), min(from_um, to_um)
         fastest = float(np.max(np.abs(model.domain[2:4])))
-        reach_um = max(0.0, 0.5 * (fastest * seconds - (top_um - bottom_um)))
+        hardest = float(np.max(np.abs(model.domain[4:6])))
+        reach_um = max(0.0, min(0.5 * (fastest * seconds - (top_um - bottom_um)), hardest * seconds**2 / 8.0))
         above = min(reach_um, max(0.0, float(model.domain[1]) - top_um))
         below = min(reach_um, max(0.0, bottom_um - float(model.domain[0])))
         turns = [(top_um + up * above, bottom_um - down * below) for up in TURNS for down in TURNS]

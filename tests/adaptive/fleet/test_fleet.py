@@ -81,7 +81,7 @@ def compare(
     if gaps:
         rng = np.random.default_rng(first)
         present = rng.random((4, n)) > 0.001
-        present[3, n // 2 : n // 2 + 12] = False
+        present[3, n // 2 : n // 2 + 40] = False
         seq[rng.integers(0, 4, 6), rng.integers(10, n, 6)] -= 1
     t_s = seq * DT
     at_um = np.linspace(12.0, 50.0, 3)[None].repeat(4, 0)
