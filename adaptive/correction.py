@@ -216,6 +216,10 @@ class Correction:
         most_V = max(self._bound_V, abs(self.u_V) * (1.0 - dt_s / self._fade_s))
         self.u_V = min(max(u_V, -most_V), most_V)
 
+    def begin(self, u_V: float, bound_V: float) -> None:
+        """Begin with ``u_V``, V, as far as it is within ``bound_V``."""
+        self.u_V = min(max(u_V, -bound_V), bound_V)
+
     def hand_over(self, taken_V: float) -> None:
         """Give up what a new model has taken over: its voltage is by ``taken_V`` above that of the one before.
 

@@ -83,9 +83,11 @@ class Unbounded(Correcting):
     def __init__(self, config: CorrectionConfig, limits: Limits, dt_s: float) -> None:
         super().__init__(replace(config, share=1.0), limits, dt_s)
 
-    def voltage(self, last: int, model: Any, point: Any, memory: FloatArray, std_V: float) -> float:
-        """As of a model of unknown error."""
-        return super().voltage(last, model, point, memory, math.inf)
+    def voltage(
+        self, first: int, model: Any, points: Any, memory: FloatArray, std_V: float, trouble: str = ""
+    ) -> float:
+        """As of a model of unknown error, whatever the service says."""
+        return super().voltage(first, model, points, memory, math.inf)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from adaptive.correction import Correction, sensitivity
 from adaptive.types import FloatArray, InverseModel
@@ -20,7 +20,7 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import column
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
-#: Displacement, µm, velocity, µm/s, and acceleration, µm/s², (1,) each.
+#: Displacement, µm, velocity, µm/s, and acceleration, µm/s², (n,) each.
 Motion = tuple[FloatArray, FloatArray, FloatArray]
 
 #: Points that are kept for readings to come; older readings are left out.
@@ -37,7 +37,7 @@ class Correcting:
 
     Attributes
     ----------
-    on : False lets the correction go, over ``fade_s``. trouble : a name, "" for none, does the same.
+    on : False lets the correction go, over ``fade_s``. trouble : for which it is let go now, "" for none.
     correction : the integral and its state.
     age : samples from a reading to the last voltage that it changes; the largest of late.
     """
@@ -85,12 +85,19 @@ class Correcting:
         if self._readings:
             self._read = self._readings[-1][0]
 
-    def voltage(self, last: int, model: InverseModel, point: Motion, memory: FloatArray, std_V: float) -> float:
-        """The correction, V, of the voltages up to sample ``last``, at ``point`` and (m,) ``memory`` of ``model``.
+    def voltage(
+        self, first: int, model: InverseModel, points: Motion, memory: FloatArray, std_V: float, trouble: str = ""
+    ) -> float:
+        """The correction, V, of the voltages for (n,) ``points`` from sample ``first`` on.
 
-        ``std_V`` : standard deviation of the model's answer, V; NaN where it states none: then nothing is corrected.
+        memory : (m,) of ``model`` before the first one. std_V : standard deviation of the model's answer to it, V; NaN
+        where it states none: then nothing is corrected. trouble : what the service has named, "" for nothing.
         """
-        correction = self.correction
+        correction, n, self.trouble = self.correction, points[0].size, trouble
+        numbers = np.arange(first, first + n)[-_KEPT:]
+        self._numbers[numbers % _KEPT] = numbers
+        self._wanted_um[numbers % _KEPT] = points[0][-_KEPT:]
+        last, point = first + n - 1, (points[0][:1], points[1][:1], points[2][:1])
         before, self._model = self._model, model
         if before is not None and before is not model and correction.u_V and before.memory_size == memory.size:
             changed_V = model.feedforward(*point, memory).u_V.item(0) - before.feedforward(*point, memory).u_V.item(0)
@@ -122,17 +129,16 @@ class Correcting:
 
     def begin(self, u_V: float, std_V: float) -> None:
         """Begin with the correction ``u_V``, V, as far as it is within its bound: a stage that is driven already."""
-        bound_V = self._bound_V(std_V)
-        self.correction.u_V = min(max(u_V, -bound_V), bound_V) if math.isfinite(u_V) else 0.0
+        if math.isfinite(u_V):
+            self.correction.begin(u_V, self._bound_V(std_V))
 
     def _bound_V(self, std_V: float) -> float:
         return min(self._most_V, _SIGMA * std_V) if std_V == std_V else 0.0
 
-    def note(self, first: int, y_um: FloatArray, good: FloatArray) -> None:
-        """Note what was asked for from sample ``first`` on: (n,) displacement, µm, and whether the model answered."""
-        numbers = np.arange(first, first + y_um.size)[-_KEPT:]
-        self._numbers[numbers % _KEPT] = numbers
-        self._wanted_um[numbers % _KEPT] = np.where(good, y_um, math.nan)[-_KEPT:]
+    def leave_out(self, first: int, flags: NDArray[Any]) -> None:
+        """Of the (n,) points from sample ``first`` on, leave out those that were answered with flags."""
+        flagged = first + np.flatnonzero(flags)[-_KEPT:]
+        self._wanted_um[flagged % _KEPT] = math.nan
 
     def _asked(self, seq: int) -> float:
         """What was asked for at sample ``seq``, µm; NaN where that is not known, or another than the model answered."""

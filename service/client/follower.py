@@ -418,7 +418,7 @@ class Follower:
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely(_arrays(motion)).u_V[0])
         if self.correcting is not None and self._number >= 0:
-            u += self._corrected(model, _arrays(motion), 1, std)
+            u += self._corrected(model, _arrays(motion), std)
         self.memory = after
         if self._fade_V:
             u += self._faded(1).item()
@@ -427,7 +427,9 @@ class Follower:
         flags |= (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
         self._u_before_V, self._answered, self._stand_in = u, model, ""
         self.last_flags, self.last_std_V = flags, std
-        self._answer_given(np.array([motion[0]]), np.array([flags]))
+        if flags and self.correcting is not None:
+            self.correcting.leave_out(self._number, np.array([flags]))
+        self._number += self._number >= 0
         return u
 
     def trajectory(
@@ -492,19 +494,11 @@ class Follower:
             self._fade_V += step_V if math.isfinite(step_V) else 0.0
         self.memory, self._u_before_V = memory.copy(), float(u[-1])
 
-    def _corrected(self, model: InverseModel, point: Motion, n: int, std_V: float) -> float:
-        """What is added to the next ``n`` voltages, V, from ``point`` on."""
+    def _corrected(self, model: InverseModel, points: Motion, std_V: float) -> float:
+        """What is added to the voltages for (n,) ``points``, V."""
         assert self.correcting is not None
-        trouble, stale = self._newest[0].safety.trouble, self.stale
-        self.correcting.trouble = trouble or ("stale" if stale else "")
-        return self.correcting.voltage(self._number + n - 1, model, point, self.memory, std_V)
-
-    def _answer_given(self, y_um: FloatArray, flags: NDArray[Any]) -> None:
-        """Count the (n,) points; of those that have flags the readings say nothing about the model."""
-        if self._number >= 0:
-            if self.correcting is not None:
-                self.correcting.note(self._number, y_um, flags == 0)
-            self._number += y_um.size
+        trouble = self._newest[0].safety.trouble or ("stale" if self.stale else "")
+        return self.correcting.voltage(self._number, model, points, self.memory, std_V, trouble)
 
     def _faded(self, n: int) -> FloatArray:
         """(n,) what is still added to the next n voltages after a resynchronisation, V."""
@@ -553,13 +547,14 @@ class Follower:
         n = got.u_V.size
         added_V = self._faded(n) if self._fade_V else np.zeros(n)
         if self.correcting is not None and self._number >= 0:
-            y, v, a = points
-            added_V += self._corrected(message.model, (y[:1], v[:1], a[:1]), n, float(got.std_V[0]))
+            added_V += self._corrected(message.model, points, float(got.std_V[0]))
         if added_V.any():
             inside = (got.flags & OUTSIDE_DOMAIN) == 0
             u_V, flags = guard(got.u_V + added_V, inside, message.model.dt_s, self.limits, self._u_before_V)
             got = got._replace(u_V=u_V, flags=got.flags | flags)
-        self._answer_given(points[0], got.flags)
+        if self.correcting is not None:
+            self.correcting.leave_out(self._number, got.flags)
+        self._number += n * (self._number >= 0)
         self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
         self._answered, self._stand_in = message.model, got.stand_in
         self.last_flags, self.last_std_V = int(got.flags[-1]), float(got.std_V[-1])

@@ -52,7 +52,7 @@ def drive(
     for k in range(n):
         if k >= age:
             seen = first + k - age
-            reading = y[seen] - error_um[k - age]
+            reading = y[seen] - error_um[k - max(age, 1)]
             follower.read(seen, reading if read is None else read(seen, reading))
         u_V[k] = follower.point(y[first + k], seq=first + k)
         error_um[k] = -OFFSET_UM - (u_V[k] - ideal.point(y[first + k])) / slope
@@ -71,7 +71,7 @@ def test_an_offset_is_corrected_to_nothing_and_without_readings_it_stays() -> No
 
 def test_the_age_is_that_of_the_stamps_and_sets_the_gain() -> None:
     gains = []
-    for age in (1, 5, 20):
+    for age in (0, 1, 5, 20):
         one = follower()
         drive(one, 200, age)
         assert one.correcting is not None
