@@ -130,7 +130,9 @@ class _Oscillation:
         if self.side:
             self.peaks_um = (*self.peaks_um, self.peak_um)[-_HALF_PERIODS - 1 :]
         self.side, self.peak_um, self.since_s = side, abs(residual_um), 0.0
-        if len(self.peaks_um) <= _HALF_PERIODS or self.peaks_um[-1] < _LASTING * self.peaks_um[0]:
+        # By pairs: a ring about another place than 0 has higher peaks on one side.
+        peaks = self.peaks_um
+        if len(peaks) <= _HALF_PERIODS or max(peaks[-2:]) < _LASTING * max(peaks[:2]):
             return False
         self.peaks_um = ()
         return True

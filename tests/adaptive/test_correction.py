@@ -218,6 +218,12 @@ def test_a_ring_that_dies_away_and_the_motion_itself_are_no_oscillation_of_the_l
     correction = made(bound_V=1.0)
     for ring in np.exp(-0.01 * 2 * np.pi * 50.0 * t) * np.sin(2 * np.pi * 50.0 * t):
         correction.take(float(ring), 1e9)
+    # After a step of the gain: about a place that comes back slowly, behind a small error on the other side.
+    correction.set(1, 1.0, 0.0, 0.2)
+    in_motion(correction, 0.06, 20)
+    correction.set(1, 1.0, 0.0, 1.0)
+    for ring in 0.8 * np.exp(-100.0 * t) + np.exp(-0.02 * 2 * np.pi * 110.0 * t) * np.sin(2 * np.pi * 110.0 * t):
+        correction.take(-0.6 * float(ring), 1e9)
     for wave in t:  # an error that goes with a motion of 25 Hz
         correction.take(0.5 * math.sin(2 * math.pi * 25.0 * wave), math.cos(2 * math.pi * 25.0 * wave))
     assert correction.halved == 0
