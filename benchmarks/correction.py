@@ -24,10 +24,15 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.correction import Correction
+from adaptive.identification import identify_lssvm
 from adaptive.types import FloatArray
+from baselines.prandtl_ishlinskii.identify import identify_mpi
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.operators import play_step
+from benchmarks.measured import Source, data_folder
 from lab.rehearsal import RehearsalConfig, identify
 from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
-from lab.rehearsal.plant import IdentifiedPlant, go_to_lowest
+from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
 from lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
 from lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
 from service.answers.guard import Limits
@@ -39,7 +44,7 @@ from service.protocol.model import ModelMessage, encode_model
 from service.protocol.samples import SampleBatch
 from service.reports.tables import markdown
 from service.server.axis_loading import load_axis
-from tests.foreign.plants import StageFactory, random_plant
+from tests.foreign.plants import random_plant
 
 Record = dict[str, Any]
 
@@ -90,12 +95,39 @@ class Unbounded(Correcting):
         return super().voltage(first, model, points, memory, math.inf)
 
 
+class FittedStack:
+    """A plant that moves as a Prandtl-Ishlinskii model of a measured record, with the noise of its sensor."""
+
+    NOISE_UM: Final = 0.07
+
+    def __init__(self, parameters: MpiParameters, dt_s: float) -> None:
+        self.dt_s, self.u_min_V, self.u_max_V = dt_s, 0.0, 5.0
+        self._parameters, self._state_V = parameters, parameters.start(0.0)
+        self._still = replace(parameters, lag_s=0.0)
+        self._keep = math.exp(-dt_s / parameters.lag_s) if parameters.lag_s > 0.0 else 0.0
+        self._um = self._still.simulate(np.zeros(1), dt_s).item()
+        self._noise = np.random.default_rng(11)
+
+    def run(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) true displacement and reading, µm, under (n,) voltages."""
+        true_um = np.empty(u_V.size)
+        for k in range(u_V.size):
+            true_um[k] = self._um
+            play_step(u_V[k], self._still.r_, self._state_V)
+            goal = self._still.simulate(u_V[k : k + 1], self.dt_s, self._state_V).item()
+            self._um = goal + self._keep * (self._um - goal)
+        return true_um, true_um + self.NOISE_UM * self._noise.standard_normal(u_V.size)
+
+
 @dataclass(frozen=True, slots=True)
 class Course:
     """A stage, identified, and the motion that all controllers are to make it follow."""
 
     seed: int
-    factory: StageFactory
+    name: str
+    make: PlantFactory
+    low_V: float
+    mode_Hz: float
     known: IdentifiedPlant
     wanted: Motion
     range_um: float
@@ -104,14 +136,40 @@ class Course:
     def of(cls, seed: int) -> Course:
         """The stage of ``seed``, and a motion of its own."""
         factory = random_plant(seed)
-        low_V, high_V = factory.traits.excite_V
+        traits = factory.traits
+        low_V, high_V = traits.excite_V
         known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
+        mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
+        return cls.along(seed, traits.hysteresis, factory, low_V, mode_Hz, known)
+
+    @classmethod
+    def measured(cls, seed: int) -> Course:
+        """A stack that others measured: identified from one record, moved as another family fits another record."""
+        dt_s, u_V, y_um = Source("picma_stack/model_sine_1hz.csv").read(data_folder())
+        other = Source("picma_stack/test_ramped_sine_ff.csv").read(data_folder())
+        parameters = identify_mpi(other[1], other[2], dt_s, fit_lag=True)[0]
+        model, report = identify_lssvm(u_V, y_um, dt_s, name=LEARN)
+        low_V, high_V, f = float(u_V.min()), float(u_V.max()), model.features
+        # The sensor's zero is another one in each record. The stage rests where the first record begins.
+        shift_um = float(np.mean(y_um - parameters.simulate(u_V, dt_s)))
+        parameters = replace(parameters, y_ref_um=parameters.y_ref_um + shift_um)
+        rest_V = float(u_V[0])
+        limits = Limits(0.0, 5.0, 500.0 * (high_V - low_V))
+        known = IdentifiedPlant(
+            {LEARN: model}, u_V, y_um, dt_s, limits, f.y_min_um, f.y_max_um, f.y_rest_um, report.heldout_mae_pct
+        )
+        return cls.along(seed, "measured stack", lambda: FittedStack(parameters, dt_s), rest_V, NO_MODE_HZ, known)
+
+    @classmethod
+    def along(
+        cls, seed: int, name: str, make: PlantFactory, low_V: float, mode_Hz: float, known: IdentifiedPlant
+    ) -> Course:
+        """An identified stage, and the motion of ``seed``."""
         span, n = known.high_um - known.low_um, round(SECONDS / known.dt_s)
-        wish = ReferenceRequest(
-            known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, SECONDS, seed
-        )  # fmt: skip
+        wish = ReferenceRequest(known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, SECONDS, seed)
         wanted = RandomReference(wish)(np.arange(n) * known.dt_s)
-        return cls(seed, factory, known, wanted, float(np.ptp(wanted.y_um[round(2.0 / known.dt_s) :])))
+        range_um = float(np.ptp(wanted.y_um[round(2.0 / known.dt_s) :]))
+        return cls(seed, name, make, low_V, mode_Hz, known, wanted, range_um)
 
     def at_rest(self) -> Course:
         """The same motion, which comes to rest with a smooth ramp after `REST_S`."""
@@ -140,7 +198,7 @@ class _Integral:
     def __init__(self, course: Course, config: CorrectionConfig, age: int) -> None:
         known = course.known
         gain = float(np.polyfit(known.u_V, known.y_um, 1)[0])
-        self._limits, self._low_V = known.limits, course.factory.traits.excite_V[0]
+        self._limits, self._low_V = known.limits, course.low_V
         self._integral = Correction(known.dt_s, config.mode_Hz, config.fade_s)
         self._integral.set(age, 1.0 / gain, 0.0, 1e9)
 
@@ -154,14 +212,14 @@ class _Integral:
 
 def follow(course: Course, way: str, age: int, case: str) -> Record:
     """(n,) true positions, µm, and corrections, V, of a run, and the counts of its correction."""
-    known, wanted, event, traits = course.known, course.wanted, course.event(case), course.factory.traits
-    config = CorrectionConfig(on=True, mode_Hz=OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ)
-    dt_s, n, low_V = known.dt_s, wanted.y_um.size, traits.excite_V[0]
+    known, wanted, event = course.known, course.wanted, course.event(case)
+    config = CorrectionConfig(on=True, mode_Hz=course.mode_Hz)
+    dt_s, n, low_V = known.dt_s, wanted.y_um.size, course.low_V
     axis = load_axis(
         STAGE, AxisConfig(AXIS, Path("benchmark"), known.limits, compete=(), snapshot_every=SNAPSHOT_EVERY),
         bundle=bundle_of(known),
     )  # fmt: skip
-    inner = course.factory()
+    inner = course.make()
     go_to_lowest(inner, low_V)
     middle_um = 0.5 * (known.low_um + known.high_um)
     scale = EventScale(course.range_um, middle_um, known.rest_um)
@@ -231,9 +289,8 @@ def figures(course: Course, got: Record) -> Record:
     }  # fmt: skip
 
 
-def run_stage(seed: int, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
-    """All runs of the stage of ``seed``; a run that raises has its traceback."""
-    course = Course.of(seed)
+def run_stage(course: Course, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
+    """All runs of a stage; a run that raises has its traceback."""
     records = []
     for case in cases:
         ways, ages = CASES[case]
@@ -241,7 +298,7 @@ def run_stage(seed: int, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
         for age in ages:
             for way in ways:
                 record: Record = {
-                    "seed": seed, "case": case, "way": way, "age": age, "hysteresis": course.factory.traits.hysteresis,
+                    "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
                     "dt_s": course.known.dt_s,
                 }  # fmt: skip
                 try:
@@ -294,7 +351,8 @@ def tables(records: Sequence[Record]) -> str:
     rows = [
         (case, str(age), *(_text(_of(records, case, way, age, "after")) for way in names),
          *(str(int((_of(records, case, way, age, "large_s") > 0.1).sum())) for way in names))
-        for case in ("payload", "stuck", "sensor_gain", "drift") for age in CASES[case][1]
+        for case in ("payload", "stuck", "sensor_gain", "drift") if any(r["case"] == case for r in records)
+        for age in CASES[case][1]
     ]  # fmt: skip
     large = tuple(f"{way}: runs above {LARGE_PCT:g} % for 0.1 s" for way in names)
     parts += ["After the event, to the end of the run:", markdown(("event", "age", *names, *large), rows)]
@@ -318,6 +376,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--first", type=int, default=1, help="first seed (%(default)s)")
     parser.add_argument("--stages", type=int, default=2, help="number of stages (%(default)s)")
+    parser.add_argument("--measured", action="store_true", help="motions on a stack that others measured instead")
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="what happens (all)")
     parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
     parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
@@ -329,7 +388,7 @@ def main() -> None:
         seeds = (seed for seed in itertools.count(args.first) if random_plant(seed).traits.dt_s > FASTEST_S)
         for seed in itertools.islice(seeds, args.stages):
             begin = time.process_time()
-            new = run_stage(seed, args.cases)
+            new = run_stage(Course.measured(seed) if args.measured else Course.of(seed), args.cases)
             records += new
             failed = sum("failed" in record for record in new)
             print(f"stage {seed}: {time.process_time() - begin:.0f} s, {failed} failed", file=sys.stderr, flush=True)
