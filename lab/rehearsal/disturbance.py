@@ -270,7 +270,7 @@ class DisturbedPlant:
         self._lagged_V = math.nan
         rng = np.random.default_rng(event.seed)
         highest = min(KNOCK_HZ[1], 0.4 / plant.dt_s)
-        self._ring_Hz = math.exp(rng.uniform(math.log(KNOCK_HZ[0]), math.log(highest)))
+        self._ring_Hz = math.exp(rng.uniform(math.log(min(KNOCK_HZ[0], highest)), math.log(highest)))
         self._ring_damping = rng.uniform(*KNOCK_DAMPING)
         self.left_out = ""
 

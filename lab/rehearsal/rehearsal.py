@@ -191,7 +191,7 @@ class _Course:
         stage_span = known.high_um - known.low_um
         # With numbers from 1 on, a snapshot falls on the last sample of a block and knows all samples so far.
         first_number = idle_samples(dt_s, block) + 1
-        axis = load_axis(STAGE, _axis_config(known, config), bundle=_bundle(known))
+        axis = load_axis(STAGE, _axis_config(known, config), bundle=bundle_of(known))
         n = math.ceil(duration_s / dt_s / block) * block
         wish = ReferenceRequest(
             known.rest_um, known.low_um + config.band[0] * stage_span, known.low_um + config.band[1] * stage_span,
@@ -235,7 +235,7 @@ def _axis_config(known: IdentifiedPlant, config: RehearsalConfig) -> AxisConfig:
     )  # fmt: skip
 
 
-def _bundle(known: IdentifiedPlant) -> Bundle:
+def bundle_of(known: IdentifiedPlant) -> Bundle:
     meta = BundleMeta(
         STAGE, AXIS, known.dt_s, y_min_um=known.low_um, y_max_um=known.high_um,
         u_min_V=float(known.u_V.min()), u_max_V=float(known.u_V.max()),

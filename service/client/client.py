@@ -31,6 +31,7 @@ from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from service.answers.answering import derivatives
 from service.answers.guard import Limits, guard, limit_voltage
+from service.client.correcting import Correcting
 from service.client.follower import Follower
 from service.protocol.errors import (
     BehindError,
@@ -551,6 +552,8 @@ class Client:
         The changes of the learning model and of "auto" are published with every batch that was learnt; any other model
         is constant and fetched once. "auto" holds all competing models: the learning model alone is faster to evaluate.
         Without ``deltas`` whole snapshots are followed: fewer, larger, and those that queries are answered from.
+        Where the axis has ``[axis.correction]`` on, the follower corrects by the readings that it is given
+        (docs/correction.md).
         """
         if not isinstance(model, str):
             raise FieldError("model", repr(model)[:80], "a name, or an empty text for the default")
@@ -586,6 +589,7 @@ class Client:
             keep=keep,
             heard=heard,
             dt_s=self.dt_s,
+            correcting=Correcting.of_status(status, self.limits, self.dt_s),
         )
         self._queries.followers.append(follower)
         follower.limits = self.limits

@@ -26,6 +26,7 @@ from baselines.competition.champion import ChampionInverse
 from service.answers.answering import begin_from, derivatives, trust_by_age
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from service.answers.guard import Limits, check_domain, guard, limit_voltage
+from service.client.correcting import Correcting, Motion
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
@@ -241,10 +242,12 @@ class Follower:
     fetch : asks for the whole model. keep : newest states that `answer` can go back to.
     heard : decides which publications are the service's; None: all. ``fetch`` tells it who answered.
     dt_s : sample time of the axis, s; NaN: that of the first model.
+    correcting : corrects the voltages by readings (docs/correction.md); None: feedforward alone.
 
     Attributes
     ----------
     memory : (m,) hysteresis memory after the last answered point.
+    correcting : what corrects the voltages, to look at and to switch; None: nothing does.
     limits : of the axis; a client replaces them when the service has others.
     received, refused : counts of models taken, whole or as changes, and of unusable messages.
     last_error : why the last one was refused.
@@ -267,6 +270,7 @@ class Follower:
         keep: int = 1,
         heard: Heard | None = None,
         dt_s: float = math.nan,
+        correcting: Correcting | None = None,
     ) -> None:
         self.limits = limits
         self.name = name
@@ -306,6 +310,9 @@ class Follower:
         self._answered: InverseModel | None = None
         self._stand_in = ""
         self._one = np.empty(1), np.empty(1)
+        self.correcting = correcting
+        #: Number of the sample that the next point is for; -1 before one was given.
+        self._number = -1
 
     @property
     def model(self) -> InverseModel:
@@ -371,8 +378,21 @@ class Follower:
         """Time since the newest snapshot arrived, s."""
         return time.monotonic() - self._newest[1]
 
-    def point(self, y_um: float, v_um_per_s: float = 0.0, a_um_per_s2: float = 0.0) -> float:
-        """The voltage, V, for the next point. Raises InputError if it is outside the domain or not finite."""
+    def read(self, seq: ArrayLike, y_um: ArrayLike) -> None:
+        """Take readings that the next voltages are corrected by; nothing happens where the axis has no correction.
+
+        seq : (n,) sample numbers, rising; the points must have numbers too. y_um : (n,) readings, µm. Raises FieldError
+        if the lengths differ or the numbers do not rise; then nothing changes.
+        """
+        if self.correcting is not None:
+            self.correcting.read(seq, y_um)
+
+    def point(self, y_um: float, v_um_per_s: float = 0.0, a_um_per_s2: float = 0.0, *, seq: int | None = None) -> float:
+        """The voltage, V, for the next point. Raises InputError if it is outside the domain or not finite.
+
+        seq : number of its sample; None: the one after the last point.
+        """
+        self._number = self._number if seq is None else seq
         limits = self.limits
         if not (limits.y_min_um <= y_um <= limits.y_max_um and math.isfinite(v_um_per_s + a_um_per_s2 + y_um)):
             raise FieldError(
@@ -397,6 +417,8 @@ class Follower:
         trust, stale = self._standing()
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely(_arrays(motion)).u_V[0])
+        if self.correcting is not None and self._number >= 0:
+            u += self._corrected(model, _arrays(motion), std)
         self.memory = after
         if self._fade_V:
             u += self._faded(1).item()
@@ -405,12 +427,20 @@ class Follower:
         flags |= (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
         self._u_before_V, self._answered, self._stand_in = u, model, ""
         self.last_flags, self.last_std_V = flags, std
+        if flags and self.correcting is not None:
+            self.correcting.leave_out(self._number, np.array([flags]))
+        self._number += self._number >= 0
         return u
 
     def trajectory(
-        self, y_um: ArrayLike, v_um_per_s: ArrayLike | None = None, a_um_per_s2: ArrayLike | None = None
-    ) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """(voltages in V, flags), each (n,), for the next n points; arguments as in ``Client.trajectory``."""
+        self, y_um: ArrayLike, v_um_per_s: ArrayLike | None = None, a_um_per_s2: ArrayLike | None = None,
+        *, seq: int | None = None,
+    ) -> tuple[FloatArray, NDArray[np.uint8]]:  # fmt: skip
+        """(voltages in V, flags), each (n,), for the next n points; arguments as in ``Client.trajectory``.
+
+        seq : number of the first one's sample; None: the one after the last point. A correction is the same for all n.
+        """
+        self._number = self._number if seq is None else seq
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         model = self._newest[0].model
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, model.dt_s)
@@ -455,11 +485,20 @@ class Follower:
         memory = message.memory if message.snapshot_seq >= 0 else model.rest_memory(float(y[0]))
         memory = model.track(y[new], v[new], a[new], u[new], memory)
         last = _arrays((float(y[-1]), 0.0, 0.0))
+        if self.correcting is not None and not math.isfinite(self._u_before_V):
+            there = model.feedforward(*last, memory)
+            self.correcting.begin(float(u[-1]) - there.u_V.item(0), there.std_V.item(0))
         if math.isfinite(self._u_before_V) and self.memory.size == memory.size:
             change_V = [model.feedforward(*last, m).u_V.item(0) for m in (self.memory, memory)]
             step_V = change_V[0] - change_V[1]
             self._fade_V += step_V if math.isfinite(step_V) else 0.0
         self.memory, self._u_before_V = memory.copy(), float(u[-1])
+
+    def _corrected(self, model: InverseModel, points: Motion, std_V: float) -> float:
+        """What is added to the voltages for (n,) ``points``, V."""
+        assert self.correcting is not None
+        trouble = self._newest[0].safety.trouble or ("stale" if self.stale else "")
+        return self.correcting.voltage(self._number, model, points, self.memory, std_V, trouble)
 
     def _faded(self, n: int) -> FloatArray:
         """(n,) what is still added to the next n voltages after a resynchronisation, V."""
@@ -505,11 +544,17 @@ class Follower:
         safety = message.safety
         rules = Rules(self.limits, safety.blend_share, *self._standing())
         got = answer_safely(message.model, self.memory, points, self._u_before_V, rules, safety.stand_in, safety.blends)
-        if self._fade_V:
+        n = got.u_V.size
+        added_V = self._faded(n) if self._fade_V else np.zeros(n)
+        if self.correcting is not None and self._number >= 0:
+            added_V += self._corrected(message.model, points, float(got.std_V[0]))
+        if added_V.any():
             inside = (got.flags & OUTSIDE_DOMAIN) == 0
-            faded_V = got.u_V + self._faded(inside.size)
-            u_V, flags = guard(faded_V, inside, message.model.dt_s, self.limits, self._u_before_V)
+            u_V, flags = guard(got.u_V + added_V, inside, message.model.dt_s, self.limits, self._u_before_V)
             got = got._replace(u_V=u_V, flags=got.flags | flags)
+        if self.correcting is not None:
+            self.correcting.leave_out(self._number, got.flags)
+        self._number += n * (self._number >= 0)
         self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
         self._answered, self._stand_in = message.model, got.stand_in
         self.last_flags, self.last_std_V = int(got.flags[-1]), float(got.std_V[-1])

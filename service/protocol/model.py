@@ -108,6 +108,8 @@ class Safety:
     blend_share, trust : see :class:`service.answers.fallback.Rules`.
     stale_s, last_good_s : see :class:`service.config.settings.AxisConfig`.
     stand_in : None if there is none.
+    trouble : name of what is wrong with the samples or the learner, "" while nothing is. Followers without a correction
+        need not know it.
     """
 
     blends: bool = False
@@ -116,6 +118,7 @@ class Safety:
     stale_s: float = 0.0
     last_good_s: float = 60.0
     stand_in: StandIn | None = None
+    trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +155,8 @@ def model_parts(
     header: dict[str, Any] = {"name": name, "kind": stored_kind(model), "dt_s": model.dt_s, "values": values}
     if safety is not None:
         entries = {key: getattr(safety, key) for key in _SAFETY_TYPES}
+        if safety.trouble:
+            entries["trouble"] = safety.trouble
         header["safety"] = entries
         if safety.stand_in is not None:
             other = safety.stand_in
@@ -211,7 +216,7 @@ def assemble(
         other = entries.pop("stand_in", None)
         # A newer service may send more entries: they are ignored.
         known: dict[str, Any] = {key: convert(entries[key]) for key, convert in _SAFETY_TYPES.items() if key in entries}
-        safety = Safety(**known)
+        safety = Safety(**known, trouble=str(entries.get("trouble", "")))
         if other is not None:
             other_name, other_values = str(other["name"]), dict(other["values"])
             made = None if stand_in is None else stand_in.model

@@ -376,6 +376,7 @@ class Axis:
             config.stale_s if learns(name, config) and not served.frozen else 0.0,
             config.last_good_s,
             served.standing_in_for(name, served.frozen),
+            served.trouble,
         )
 
     def differs(self, seq: int, theirs: str) -> bool:

@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from typing import Any, Final
 
@@ -89,6 +90,7 @@ def axis_status(
         "snapshot_every": axis.config.snapshot_every,
         "snapshots_kept": axis.config.snapshots_kept,
         "delta_hz": axis.config.delta_hz,
+        "correction": asdict(axis.config.correction) if axis.config.correction.on else None,
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
             **counts.samples,

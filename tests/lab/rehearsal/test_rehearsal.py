@@ -437,3 +437,14 @@ def test_all_messages_lost_leaves_the_model_served() -> None:
     assert course.verdicts[0] == "never_came"
     assert never.sum() == pytest.approx(1000, abs=1)
     assert done.runs[0].outcome.adaptive.settled_pct < 0.5
+
+
+def test_a_stage_of_200_hz_can_be_disturbed() -> None:
+    """A knock rings slower than its samples can show; of 250 Hz and less the range of such rings was empty."""
+    plant = DisturbedPlant(
+        FunctionPlant(lambda u_V: (u_V, u_V), 5e-3, 0.0, 10.0),
+        Event("knock", "knock", 2.0, 0.05),
+        EventScale(10.0, 5.0, 0.0),
+    )
+    true_um, _ = plant.run(400, np.zeros(100))
+    assert 0.1 < np.abs(true_um).max() <= 0.5

@@ -1,0 +1,402 @@
+"""What the guarded correction comes to on stages of others, beside its rivals, all in one run and side by side.
+
+``python -m benchmarks.correction --first 1 --stages 2 [--json out/correction.jsonl]``. Each stage
+(``tests/foreign/plants.py``) is identified; then the same motion, which does not repeat, is followed by five
+controllers at each age of the readings, and something happens. ``--table FILE`` prints the tables of finished runs.
+Errors are mean absolute errors of the true position in percent of the commanded range. The age counts for the
+correction and for the learner alike: age 1 is the reading of the sample before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from adaptive.correction import Correction
+from adaptive.identification import identify_lssvm
+from adaptive.types import FloatArray
+from baselines.prandtl_ishlinskii.identify import identify_mpi
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.operators import play_step
+from benchmarks.measured import Source, data_folder
+from lab.rehearsal import RehearsalConfig, identify
+from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
+from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
+from lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
+from lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
+from service.answers.guard import Limits
+from service.client.correcting import Correcting
+from service.client.follower import Follower
+from service.config.correction import CorrectionConfig
+from service.config.settings import LEARN, AxisConfig
+from service.protocol.model import ModelMessage, encode_model
+from service.protocol.samples import SampleBatch
+from service.reports.tables import markdown
+from service.server.axis_loading import load_axis
+from tests.foreign.plants import random_plant
+
+Record = dict[str, Any]
+
+#: Controllers: the learning feedforward alone and with the correction; the frozen one with an integral of the same
+#: gain, without bound or doubts, and alone; that integral alone.
+WAYS: Final = ("alone", "corrected", "frozen+I", "frozen", "I")
+AGES: Final = (1, 5, 20)
+#: What happens: event, controllers and ages.
+CASES: Final = {
+    "gain": (WAYS, AGES),
+    "payload": (("alone", "corrected", "frozen+I"), (1, 20)),
+    "rest": (("alone", "corrected"), (1, 5)),
+    "stuck": (("alone", "corrected", "frozen+I"), (5,)),
+    "sensor_gain": (("alone", "corrected"), (5,)),
+    "drift": (("alone", "corrected"), (5,)),
+}  # fmt: skip
+#: Length of a run, when its event happens, and when its errors begin to count, s.
+SECONDS: Final = 6.0
+EVENT_S: Final = 4.0
+COUNT_S: Final = 2.0
+#: A stage at rest rests from here on, and its jitter counts so much later, s.
+REST_S: Final = 3.0
+SETTLED_S: Final = 1.0
+#: A drifting sensor, share of the range a second.
+DRIFT_PER_S: Final = 0.01
+#: Step of the gain; the frequency that is stated where a stage has no mode, Hz, and as a share of that of its first
+#: mode, which a payload of twice the moved mass leaves of it.
+STEP: Final = 0.06
+NO_MODE_HZ: Final = 300.0
+OF_MODE: Final = 1.0 / math.sqrt(3.0)
+#: Faster stages are left out: a run of them takes minutes.
+FASTEST_S: Final = 4e-4
+RESYNCHRONISE_S: Final = 0.25
+SNAPSHOT_EVERY: Final = 5
+LARGE_PCT: Final = 5.0
+
+
+class Unbounded(Correcting):
+    """The rival: the same integral, that keeps to the drive's range alone and doubts nothing."""
+
+    def __init__(self, config: CorrectionConfig, limits: Limits, dt_s: float) -> None:
+        super().__init__(replace(config, share=1.0), limits, dt_s)
+
+    def voltage(
+        self, first: int, model: Any, points: Any, memory: FloatArray, std_V: float, trouble: str = ""
+    ) -> float:
+        """As of a model of unknown error, whatever the service says."""
+        return super().voltage(first, model, points, memory, math.inf)
+
+
+class FittedStack:
+    """A plant that moves as a Prandtl-Ishlinskii model of a measured record, with the noise of its sensor."""
+
+    NOISE_UM: Final = 0.07
+
+    def __init__(self, parameters: MpiParameters, dt_s: float) -> None:
+        self.dt_s, self.u_min_V, self.u_max_V = dt_s, 0.0, 5.0
+        self._parameters, self._state_V = parameters, parameters.start(0.0)
+        self._still = replace(parameters, lag_s=0.0)
+        self._keep = math.exp(-dt_s / parameters.lag_s) if parameters.lag_s > 0.0 else 0.0
+        self._um = self._still.simulate(np.zeros(1), dt_s).item()
+        self._noise = np.random.default_rng(11)
+
+    def run(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) true displacement and reading, µm, under (n,) voltages."""
+        true_um = np.empty(u_V.size)
+        for k in range(u_V.size):
+            true_um[k] = self._um
+            play_step(u_V[k], self._still.r_, self._state_V)
+            goal = self._still.simulate(u_V[k : k + 1], self.dt_s, self._state_V).item()
+            self._um = goal + self._keep * (self._um - goal)
+        return true_um, true_um + self.NOISE_UM * self._noise.standard_normal(u_V.size)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A stage, identified, and the motion that all controllers are to make it follow."""
+
+    seed: int
+    name: str
+    make: PlantFactory
+    low_V: float
+    mode_Hz: float
+    known: IdentifiedPlant
+    wanted: Motion
+    range_um: float
+
+    @classmethod
+    def of(cls, seed: int) -> Course:
+        """The stage of ``seed``, and a motion of its own."""
+        factory = random_plant(seed)
+        traits = factory.traits
+        low_V, high_V = traits.excite_V
+        known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
+        mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
+        return cls.along(seed, traits.hysteresis, factory, low_V, mode_Hz, known)
+
+    @classmethod
+    def measured(cls, seed: int) -> Course:
+        """A stack that others measured: identified from one record, moved as another family fits another record."""
+        dt_s, u_V, y_um = Source("picma_stack/model_sine_1hz.csv").read(data_folder())
+        other = Source("picma_stack/test_ramped_sine_ff.csv").read(data_folder())
+        parameters = identify_mpi(other[1], other[2], dt_s, fit_lag=True)[0]
+        model, report = identify_lssvm(u_V, y_um, dt_s, name=LEARN)
+        low_V, high_V, f = float(u_V.min()), float(u_V.max()), model.features
+        # The sensor's zero is another one in each record. The stage rests where the first record begins.
+        shift_um = float(np.mean(y_um - parameters.simulate(u_V, dt_s)))
+        parameters = replace(parameters, y_ref_um=parameters.y_ref_um + shift_um)
+        rest_V = float(u_V[0])
+        limits = Limits(0.0, 5.0, 500.0 * (high_V - low_V))
+        known = IdentifiedPlant(
+            {LEARN: model}, u_V, y_um, dt_s, limits, f.y_min_um, f.y_max_um, f.y_rest_um, report.heldout_mae_pct
+        )
+        return cls.along(seed, "measured stack", lambda: FittedStack(parameters, dt_s), rest_V, NO_MODE_HZ, known)
+
+    @classmethod
+    def along(
+        cls, seed: int, name: str, make: PlantFactory, low_V: float, mode_Hz: float, known: IdentifiedPlant
+    ) -> Course:
+        """An identified stage, and the motion of ``seed``."""
+        span, n = known.high_um - known.low_um, round(SECONDS / known.dt_s)
+        wish = ReferenceRequest(known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, SECONDS, seed)
+        wanted = RandomReference(wish)(np.arange(n) * known.dt_s)
+        range_um = float(np.ptp(wanted.y_um[round(2.0 / known.dt_s) :]))
+        return cls(seed, name, make, low_V, mode_Hz, known, wanted, range_um)
+
+    def at_rest(self) -> Course:
+        """The same motion, which comes to rest with a smooth ramp after `REST_S`."""
+        dt_s, y = self.known.dt_s, self.wanted.y_um
+        t_s = np.arange(y.size) * dt_s - REST_S
+        q = np.clip(1.0 - t_s / 0.3, 0.0, 1.0)
+        weight = q**4 * (35.0 - 84.0 * q + 70.0 * q**2 - 20.0 * q**3)
+        level = float(y[round(REST_S / dt_s)])
+        moved = level + weight * (y - level)
+        speed = np.gradient(moved, dt_s)
+        return replace(self, wanted=Motion(moved, speed, np.gradient(speed, dt_s)))
+
+    def event(self, name: str) -> Event:
+        """What happens in the case ``name``."""
+        rng = np.random.default_rng([self.seed, 51])
+        sign = float(rng.choice([-1.0, 1.0]))
+        size = {"gain": STEP * sign, "payload": float(rng.uniform(1.0, 2.0)), "sensor_gain": 1.0 + 0.6 * sign}
+        kind = "none" if name in ("rest", "drift") else name
+        over_s = SECONDS - EVENT_S if name in ("stuck", "sensor_gain") else 0.0
+        return Event(name, kind, EVENT_S, size.get(name, 0.0), over_s, self.seed)
+
+
+class _Integral:
+    """The rival without a feedforward: the mean slope of the stage, and the same design."""
+
+    def __init__(self, course: Course, config: CorrectionConfig, age: int) -> None:
+        known = course.known
+        gain = float(np.polyfit(known.u_V, known.y_um, 1)[0])
+        self._limits, self._low_V = known.limits, course.low_V
+        self._integral = Correction(known.dt_s, config.mode_Hz, config.fade_s)
+        self._integral.set(age, 1.0 / gain, 0.0, 1e9)
+
+    def voltage(self, residual_um: float) -> float:
+        """The next voltage, V, after a residual, µm; without wind-up at the limits."""
+        self._integral.take(residual_um, math.inf)
+        u_V = min(max(self._low_V + self._integral.u_V, self._limits.u_min_V), self._limits.u_max_V)
+        self._integral.u_V = u_V - self._low_V
+        return u_V
+
+
+def follow(course: Course, way: str, age: int, case: str) -> Record:
+    """(n,) true positions, µm, and corrections, V, of a run, and the counts of its correction."""
+    known, wanted, event = course.known, course.wanted, course.event(case)
+    config = CorrectionConfig(on=True, mode_Hz=course.mode_Hz)
+    dt_s, n, low_V = known.dt_s, wanted.y_um.size, course.low_V
+    axis = load_axis(
+        STAGE, AxisConfig(AXIS, Path("benchmark"), known.limits, compete=(), snapshot_every=SNAPSHOT_EVERY),
+        bundle=bundle_of(known),
+    )  # fmt: skip
+    inner = course.make()
+    go_to_lowest(inner, low_V)
+    middle_um = 0.5 * (known.low_um + known.high_um)
+    scale = EventScale(course.range_um, middle_um, known.rest_um)
+    plant, sensor = DisturbedPlant(inner, event, scale), DisturbedSensor(event, scale, dt_s, n)
+    drift_um = DRIFT_PER_S * course.range_um * np.maximum(np.arange(n) * dt_s - EVENT_S, 0.0) * (case == "drift")
+    rest = round(0.2 / dt_s)
+    numbers, rest_V = np.arange(1, rest + 1), np.full(rest, low_V)
+    axis.handle(SampleBatch(numbers, numbers * dt_s, rest_V, plant.run(-rest, rest_V)[1]))
+    first, limits = rest + 1, axis.limits
+
+    def newest() -> ModelMessage:
+        model, seq, memory = axis.model(LEARN)
+        return ModelMessage(LEARN, model, seq, memory, axis.safety(LEARN))
+
+    made = {"corrected": Correcting, "frozen+I": Unbounded}
+    correcting = made[way](config, limits, dt_s) if way in made else None
+    begun = newest()
+    payload = encode_model(LEARN, begun.model, begun.snapshot_seq, begun.memory, begun.safety)
+    follower = Follower(None, None, LEARN, lambda: payload, limits, correcting=correcting)  # type: ignore[arg-type]
+    integral = _Integral(course, config, age) if way == "I" else None
+    learns = way in ("alone", "corrected")
+    true_um, read_um, u_V, added_V = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    y, v, a = (column.tolist() for column in wanted)
+    every, served = round(RESYNCHRONISE_S / dt_s), axis.newest
+    for k in range(n):
+        seen = k - age
+        if seen >= 0 and learns:
+            number = np.array([first + seen])
+            axis.handle(SampleBatch(number, number * dt_s, u_V[seen : seen + 1], read_um[seen : seen + 1]))
+            if axis.newest is not served:
+                served = axis.newest
+                follower._take(newest())
+            if k % every == every - 1:
+                part = np.arange(max(follower.snapshot_seq - 1 - first, 0), seen + 1)
+                follower.resynchronise(first + part, u_V[part], read_um[part])
+        if integral is not None:
+            u_V[k] = integral.voltage(y[seen] - read_um.item(seen)) if seen >= 0 else low_V
+        else:
+            if seen >= 0:
+                follower.read(first + seen, read_um[seen])
+            u_V[k] = follower.point(y[k], v[k], a[k], seq=first + k)
+        added_V[k] = 0.0 if correcting is None else correcting.correction.u_V
+        true, read = plant.run(k, u_V[k : k + 1])
+        true_um[k] = true[0]
+        read_um[k] = sensor.read(k, read)[0] + drift_um[k]
+    counts = {} if correcting is None else {
+        "halved": correcting.correction.halved, "doubted": correcting.correction.doubted,
+        "gain_per_s": correcting.correction.loop.gain_per_s,
+    }  # fmt: skip
+    return {"true_um": true_um, "added_V": added_V, "trouble": axis.newest.trouble, **counts}
+
+
+def figures(course: Course, got: Record) -> Record:
+    """Errors in percent of the range, as JSON values."""
+    dt_s, limits = course.known.dt_s, course.known.limits
+    error = 100.0 / course.range_um * np.abs(course.wanted.y_um - got["true_um"])
+    begin, at, second = round(COUNT_S / dt_s), round(EVENT_S / dt_s), round(1.0 / dt_s)
+    settled = got["true_um"][round((REST_S + SETTLED_S) / dt_s) :]
+    added = 100.0 / (limits.u_max_V - limits.u_min_V) * np.abs(got["added_V"])
+    return {
+        "before": float(error[begin:at].mean()), "first": float(error[at : at + second].mean()),
+        "after": float(error[at:].mean()), "large_s": float((error[begin:] > LARGE_PCT).sum() * dt_s),
+        # The slow part, creep and drift, is no jitter.
+        "jitter": float(np.std(np.diff(settled)) / course.range_um * 100.0),
+        "carried": float(added[begin:at].mean()), "carried_after": float(added[at + second :].mean()),
+        **{key: got[key] for key in ("halved", "doubted", "gain_per_s", "trouble") if key in got},
+    }  # fmt: skip
+
+
+def run_stage(course: Course, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
+    """All runs of a stage; a run that raises has its traceback."""
+    records = []
+    for case in cases:
+        ways, ages = CASES[case]
+        there = course.at_rest() if case == "rest" else course
+        for age in ages:
+            for way in ways:
+                record: Record = {
+                    "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
+                    "dt_s": course.known.dt_s,
+                }  # fmt: skip
+                try:
+                    record |= figures(there, follow(there, way, age, case))
+                except Exception:
+                    record["failed"] = traceback.format_exc()
+                records.append(record)
+    return records
+
+
+# ---- tables
+
+
+def _of(records: Sequence[Record], case: str, way: str, age: int, name: str) -> FloatArray:
+    """(stages,) figures, in the order of the seeds."""
+    found = {r["seed"]: r[name] for r in records if (r["case"], r["way"], r["age"]) == (case, way, age)}
+    return np.array([found[seed] for seed in sorted(found)], dtype=np.float64)
+
+
+def _text(values: FloatArray, digits: int = 3) -> str:
+    """Median and worst."""
+    return f"{np.median(values):.{digits}f} / {values.max():.{digits}f}" if values.size else "-"
+
+
+def tables(records: Sequence[Record]) -> str:
+    """Markdown: errors by controller and age, and what happens."""
+    records = [record for record in records if "failed" not in record]
+    stages = len({record["seed"] for record in records})
+    rows = [
+        (
+            str(age), *(_text(_of(records, "gain", way, age, "before")) for way in WAYS),
+            *(_text(_of(records, "gain", "corrected", age, "before") / _of(records, "gain", way, age, "before"), 2)
+              for way in ("frozen+I", "alone")),
+        )
+        for age in AGES
+    ]  # fmt: skip
+    head = ("age, samples", *WAYS, "corrected over frozen+I", "corrected over alone")
+    parts = [f"{stages} stages, median / worst, % of the range. Motion that does not repeat:", markdown(head, rows)]
+    rows = [
+        (str(age), *(_text(_of(records, "gain", way, age, "first")) for way in WAYS),
+         _text(_of(records, "gain", "corrected", age, "carried")),
+         _text(_of(records, "gain", "corrected", age, "carried_after")))
+        for age in AGES
+    ]  # fmt: skip
+    parts += [
+        f"First second after a step of the gain by ±{100.0 * STEP:g} %; what the correction carries, % of the drive:",
+        markdown(("age, samples", *WAYS, "carried before", "carried later"), rows),
+    ]
+    names = ("alone", "corrected", "frozen+I")
+    rows = [
+        (case, str(age), *(_text(_of(records, case, way, age, "after")) for way in names),
+         *(str(int((_of(records, case, way, age, "large_s") > 0.1).sum())) for way in names))
+        for case in ("payload", "stuck", "sensor_gain", "drift") if any(r["case"] == case for r in records)
+        for age in CASES[case][1]
+    ]  # fmt: skip
+    large = tuple(f"{way}: runs above {LARGE_PCT:g} % for 0.1 s" for way in names)
+    parts += ["After the event, to the end of the run:", markdown(("event", "age", *names, *large), rows)]
+    rows = [
+        (str(age), *(_text(_of(records, "rest", way, age, "jitter"), 4) for way in names),
+         _text(_of(records, "rest", "corrected", age, "jitter") / _of(records, "rest", "alone", age, "jitter"), 2))
+        for age in CASES["rest"][1]
+    ]  # fmt: skip
+    parts += [
+        "Jitter at rest, standard deviation of the change from sample to sample:",
+        markdown(("age", *names, "corrected over alone"), rows),
+    ]
+    halved = sum(record.get("halved", 0) > 0 for record in records if record["way"] == "corrected")
+    parts.append(f"Corrected runs in which an oscillation halved the gain: {halved} of "
+                 f"{sum(record['way'] == 'corrected' for record in records)}.")  # fmt: skip
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first", type=int, default=1, help="first seed (%(default)s)")
+    parser.add_argument("--stages", type=int, default=2, help="number of stages (%(default)s)")
+    parser.add_argument("--measured", action="store_true", help="motions on a stack that others measured instead")
+    parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="what happens (all)")
+    parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
+    parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
+    args = parser.parse_args()
+    records: list[Record] = []
+    if args.table is not None:
+        records = [json.loads(line) for line in args.table.read_text(encoding="utf-8").splitlines()]
+    else:
+        seeds = (seed for seed in itertools.count(args.first) if random_plant(seed).traits.dt_s > FASTEST_S)
+        for seed in itertools.islice(seeds, args.stages):
+            begin = time.process_time()
+            new = run_stage(Course.measured(seed) if args.measured else Course.of(seed), args.cases)
+            records += new
+            failed = sum("failed" in record for record in new)
+            print(f"stage {seed}: {time.process_time() - begin:.0f} s, {failed} failed", file=sys.stderr, flush=True)
+            if args.json is not None:
+                with args.json.open("a", encoding="utf-8") as out:
+                    out.writelines(json.dumps(record) + "\n" for record in new)
+    print(tables(records))
+
+
+if __name__ == "__main__":
+    main()
