@@ -53,7 +53,7 @@ def operate(
     until = time.monotonic() + _SETTLE_S
     while True:
         error: bytes | None = None
-        question, unsigned = by.question(payload=payload), 0
+        question, unsigned = by.question(payload=payload, key=keys.operate), 0
         for reply in session.get(
             keys.operate, payload=payload, timeout=timeout_s, attachment=question.attachment, **EVERYBODY
         ):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ import zenoh
 
 from service.client.client import Client
 from service.config.settings import read_config
+from service.operating.remote import operate
 from service.protocol.delta import FollowedState, encode_delta
 from service.protocol.errors import NoReplyError
 from service.protocol.keys import Keys
@@ -132,6 +134,40 @@ def test_samples_of_a_liar_are_not_learnt_where_the_stage_signs(endpoint: str, l
         assert not gates.get("out_of_order")
         assert status["samples"]["received"] == 1000
         assert status["peers"]["samples_refused"] == 199
+
+
+def test_a_liar_commands_nothing(endpoint: str, liar: zenoh.Session) -> None:
+    """Neither by a request of its own, nor by one of an operator that it recorded and repeats."""
+    heard: list[tuple[bytes, bytes]] = []
+    events: list[dict[str, Any]] = []
+
+    def listen(query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            assert query.attachment is not None
+            heard.append((query.payload.to_bytes(), query.attachment.to_bytes()))
+
+    with Client.connect(endpoint, wait_s=20.0) as client, open_client(endpoint, 20.0) as operator, ExitStack() as stack:
+        stack.callback(liar.declare_queryable(KEYS.operate, listen).undeclare)
+        subscriber = operator.declare_subscriber(KEYS.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+        stack.callback(subscriber.undeclare)
+        time.sleep(0.2)
+        for verb in ("freeze", "thaw"):
+            assert operate(operator, KEYS, verb, "alice")["ok"]
+        freeze = heard[0]
+        for payload, attachment in (freeze, (freeze[0], heard[1][1]), (freeze[0], bytes(32))):
+            errors = [reply.err for reply in liar.get(KEYS.operate, payload=payload, attachment=attachment)]
+            assert any(error is not None and b"authenticator" in error.payload.to_bytes() for error in errors)
+        status = client.status()
+        assert not status["frozen"]
+        assert (status["operations"]["done"], status["operations"]["unsigned"]) == (2, 3)
+
+        def refused() -> list[str]:
+            return [event["detail"] for event in events if event["event"] == "operation_refused"]
+
+        eventually(refused)
+        assert len(refused()) == 1
+        assert "authenticator" in refused()[0]
 
 
 def test_what_a_liar_recorded_answers_no_other_query(endpoint: str, liar: zenoh.Session) -> None:
