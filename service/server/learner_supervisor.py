@@ -125,7 +125,7 @@ class ModelWatchConfig:
     unseen_s: float = 0.1
     last_good_s: float = 60.0
     ramp_s: float = 1.0
-    silent_s: float = 2.0
+    silent_s: float = 0.5
     revive_s: float = 5.0
 
 
