@@ -20,11 +20,12 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateD
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sequence import AHEAD
+from service.protocol.model import fingerprint
 from service.protocol.query import STAND_IN, FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_supervisor import NOTHING_LEARNT, UNUSABLE, ModelWatch, ModelWatchConfig, fingerprint
+from service.server.learner_supervisor import NOTHING_LEARNT, UNUSABLE, ModelWatch, ModelWatchConfig
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.conftest import DT_S, make_models
