@@ -57,6 +57,7 @@ class AxisServer:
     ----------
     role : "primary" while it serves, else "standby". epoch : number of its take-over, see `RoleControl`.
     synced : whether the model is the one to be served: its own, or, of a standby, that of the serving instance.
+    claims_refused : count of claims of others that prove nothing.
     loop : the thread of the axis. checkpoints : writes them.
     """
 
@@ -80,7 +81,6 @@ class AxisServer:
         self.role = STANDBY
         self.synced = True
         self.epoch = 0
-        #: Claims of others that prove nothing.
         self.claims_refused = 0
         #: Count of all samples when the last command was applied.
         self._operated_at = 0
@@ -155,18 +155,6 @@ class AxisServer:
         """Drop the tuning under way, because another instance serves. From the thread of the axis."""
         if self.loop.retuner is not None:
             self.loop.retuner.leave()
-
-    def set_synced(self, synced: bool) -> None:
-        """Whether the model is the one to be served."""
-        self.synced = synced
-
-    def set_epoch(self, epoch: int) -> None:
-        """The number of this instance's take-over."""
-        self.epoch = epoch
-
-    def set_claims_refused(self, count: int) -> None:
-        """How many claims were ignored because they prove nothing."""
-        self.claims_refused = count
 
     def declare(self) -> None:
         """Take samples and serve."""
