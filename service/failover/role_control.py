@@ -213,7 +213,7 @@ class RoleControl:
         self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=False)
         self.settled = threading.Event()
         self.ready = threading.Event()
-        server.synced = False
+        server.set_synced(False)
         server.loop.set_gate(self.model.gate)
 
     def start(self) -> None:
@@ -344,7 +344,7 @@ class RoleControl:
         if self.claims.unsigned and not self.server.claims_refused:
             detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
             self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
-        self.server.claims_refused = self.claims.unsigned
+        self.server.set_claims_refused(self.claims.unsigned)
 
     def _check_rival(self, rival: Claim | None) -> None:
         """Claim again if a rival with a lower claim goes on serving.
@@ -367,7 +367,7 @@ class RoleControl:
         """Declare a claim above all known ones, then withdraw the previous one."""
         server, before = self.server, self._token
         self._epoch = max(self._epoch + 1, self.claims.next_epoch())
-        server.epoch = self._epoch
+        server.set_epoch(self._epoch)
         key = claim_key(server.authenticator, server.keys, Claim(self._epoch, server.instance))
         self._token = self._session.liveliness().declare_token(key)
         if before is not None:
@@ -381,7 +381,7 @@ class RoleControl:
         server.serve()
         server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
-        server.synced = True
+        server.set_synced(True)
         self.settled.set()
         self.ready.set()
 
@@ -389,7 +389,7 @@ class RoleControl:
         server = self.server
         server.axis.note("stood_down", f"{other.instance} serves: it took over while this instance was unreachable")
         # First: the status must not claim that this is the served model.
-        server.synced = False
+        server.set_synced(False)
         server.stand_down()
         self._drop_claim()
         self._rival_at = None
@@ -451,7 +451,7 @@ class RoleControl:
         if not self._outdated:  # no verb came while it was sent
             self._switch = None
         self._refusal = ""
-        server.synced = True
+        server.set_synced(True)
         self.ready.set()
         return True
 
