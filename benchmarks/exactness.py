@@ -23,11 +23,11 @@ from service.client.client import Client
 from service.config.settings import AxisConfig, read_config
 from service.failover.state_transfer import fetch_state
 from service.protocol.errors import ServiceError
+from service.protocol.model import fingerprint
 from service.protocol.samples import joined
 from service.security.authenticator import own_authenticator
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
-from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 #: Messages that the offline axis gets at a time; a live service never groups them so.

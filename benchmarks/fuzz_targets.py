@@ -20,7 +20,6 @@ from adaptive.inverse_model import LssvmInverse
 from benchmarks.forged_states import edited, make_axis, recording
 from benchmarks.small_models import small_models
 from service.failover.role_control import Claims
-from service.failover.state_transfer import joined
 from service.operating.verbs import Request, decode_request, encode_request
 from service.protocol import delta as wire_delta
 from service.protocol import model as wire_model
@@ -107,17 +106,6 @@ def _changing() -> Target:
     return target
 
 
-def _parts(data: bytes) -> None:
-    """Parts of a state, each of up to three bytes after its header: joined if complete, else nothing."""
-    pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
-    whole = next(joined(("sender", piece) for piece in pieces), None)
-    if whole is None:
-        return
-    of = int.from_bytes(pieces[0][4:8], "little")
-    if len(pieces) < of or whole != b"".join(piece[8:] for piece in pieces[:of]):
-        raise AssertionError("parts were taken for a whole that they do not make")
-
-
 def _claims() -> Target:
     """Keys of liveliness tokens: whatever they say, nobody who lacks the key has a claim."""
     keys = Keys("demo", "x")
@@ -183,7 +171,6 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "state": _state,
     "claim": _claims,
     "owner": _owners,
-    "parts": lambda: _parts,
     "fault": lambda: _refusing(decode_fault),
     "operate": lambda: _refusing(decode_request),
     "error": lambda: _refusing(error_from_json),
@@ -241,7 +228,6 @@ def seeds(target: str) -> list[bytes]:
             b"1/0123456789abcdef/2/lab1",
         ],
         "claim": [b"3/i-rogue/00ff00ff00ff00ff00ff00ff00ff00ff", b"999999999/i-rogue"],
-        "parts": [b"".join(struct.pack("<II3s", i, 3, b"abc") for i in range(3))],
         "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],
         "operate": [
             encode_request(Request("rollback", "alice", {"checkpoint": 3})),

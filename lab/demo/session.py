@@ -47,6 +47,8 @@ from sim.stage.stage import Stage
 
 #: A process may end so much later than planned, s.
 _OVERTIME_S: Final = 30.0
+#: Longest time for which samples of a stage that has ended are on their way to this process, on a busy machine, s.
+_ON_THE_WAY_S: Final = 5.0
 
 
 def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: Callable[[int], None]) -> None:
@@ -79,7 +81,10 @@ def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: 
             for first in range(0, len(u_V), 1000):
                 commands.put(wire.encode_command(first, u_V[first : first + 1000]))
             until = time.monotonic() + plan.identify_s + _OVERTIME_S
-            while received < len(u_V) and stage.running and time.monotonic() < until:
+            running = True
+            while received < len(u_V) and time.monotonic() < until:
+                if running and not stage.running:
+                    running, until = False, min(until, time.monotonic() + _ON_THE_WAY_S)
                 progress(received)
                 time.sleep(0.2)
             if stage.wait(_OVERTIME_S) != 0 or received < len(u_V):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import struct
 import sys
 import time
 from collections import deque
@@ -27,7 +26,7 @@ from lab.soak.controller import AXIS, SERVED, STAGE
 from lab.testbed.processes import run_client_process
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
-from service.failover.state_transfer import fetch_state, send_state
+from service.failover.state_transfer import fetch_state, part_of
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
 from service.runtime.stopping import StopSignal
@@ -100,7 +99,8 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
             stranger.see(query)
             with query:
                 if not mine[0]:
-                    send_state(query, keys.state, encode_checkpoint(*next(states)))
+                    part, _ = part_of(b"".join(encode_checkpoint(*next(states))), 0)
+                    query.reply(keys.state, part, attachment=query.attachment)
 
         held: deque[zenoh.Query] = deque(maxlen=_CROWD)
 
@@ -110,7 +110,7 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
                 with query:
                     return
             held.append(query)
-            query.reply(keys.state, struct.pack("<II", 0, 50) + bytes(50_000), attachment=bytes(32))
+            query.reply(keys.state, part_of(bytes(3_000_000), 0)[0], attachment=bytes(32))
 
         queryable = session.declare_queryable(keys.state, answer)
         for _ in range(_CROWD):

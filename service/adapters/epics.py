@@ -150,7 +150,7 @@ class EpicsAxis:
 
     def _enable(self, on: bool) -> None:
         model = self._enabled_model if on else PLAIN
-        operate(self._session, self._keys, "select", "epics", {"model": model}, self._timeout_s)
+        operate(self._session, self._keys, "select", "epics", {"model": model}, self._timeout_s, self._by)
         self.poll()
 
 

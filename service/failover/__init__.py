@@ -1,9 +1,8 @@
 """Failover of an axis: one instance serves, standbys hold the same model, and one of them takes over if it fails.
 
-`role_control` decides the role of an instance, `claims` holds the rule of precedence, `reachability` detects a lost
-router, `standby_model` keeps the model of a standby equal to the served one, `state_transfer` sends its state, and
-`peer_files` reads what the other instance has left on the disk. The names are loaded on first use: the server needs
-some of these modules, and `role_control` needs the server.
+`role_control` decides the role of an instance, `standby_model` keeps the model of a standby equal to the served one and
+reads what the other instance has left on the disk, `state_transfer` is what instances ask each other. The names
+are loaded on first use: the server needs some of these modules, and `role_control` needs the server.
 """
 
 from __future__ import annotations

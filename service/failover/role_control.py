@@ -9,18 +9,18 @@ import math
 import re
 import threading
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
 from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, status_of
+from service.failover.state_transfer import fetch_state, status_of
 from service.operating.server import FREEZE, THAW, Switch
 from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
-from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.security.authenticator import NO_KEY, Authenticator
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
@@ -39,7 +39,6 @@ class Claim:
 
     epoch: int
     instance: str
-    tag: str = field(default="", compare=False)
 
 
 #: Greatest epoch that is taken for one: a take-over every second for thirty years.
@@ -47,12 +46,19 @@ MAX_EPOCH: Final = 10**9
 _CLAIM: Final = re.compile(r"/claim/([0-9]{1,10})/([a-z][a-z0-9_-]{0,63})(?:/([0-9a-f]{1,64}))?$")
 
 
-def parse_claim(key: str) -> Claim | None:
-    """The claim in the key of a token; None if the key is not a claim, or its epoch is out of range."""
+def claim_key(by: Authenticator, keys: Keys, claim: Claim) -> str:
+    """The key of the token that claims; its tag shows that others repeat at most what was said."""
+    key = keys.claim(claim.epoch, claim.instance)
+    return keys.claim(claim.epoch, claim.instance, by.tag("claim", key).hex())
+
+
+def read_claim(by: Authenticator, keys: Keys, key: str) -> Claim | None:
+    """The claim in the key of a token; None if the key is not a claim, its epoch is out of range or its tag wrong."""
     found = _CLAIM.search(key)
     if found is None or int(found[1]) > MAX_EPOCH:
         return None
-    return Claim(int(found[1]), found[2], found[3] or "")
+    claim = Claim(int(found[1]), found[2])
+    return None if by and key != claim_key(by, keys, claim) else claim
 
 
 class Claims:
@@ -60,34 +66,28 @@ class Claims:
 
     Attributes
     ----------
-    changed : set after every update. unsigned : count of claims that were ignored because their tag is wrong.
+    changed : set after every update. unsigned : count of claims that were ignored because they prove nothing.
     """
 
     def __init__(self, keys: Keys, instance: str, authenticator: Authenticator = NO_KEY) -> None:
         self.unsigned = 0
-        self._by = authenticator
-        self._ignored: set[Claim] = set()
-        self.keys = keys
-        self.instance = instance
         self.changed = threading.Event()
+        self._keys, self._instance, self._by = keys, instance, authenticator
         self._alive: set[Claim] = set()
+        self._ignored: set[Claim] = set()
         self._highest_epoch = 0
         self._lock = threading.Lock()
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared (``alive``) or disappeared."""
-        claim = parse_claim(key)
-        if claim is None or claim.instance == self.instance:
-            return
-        right = claim_tag(self._by, self.keys, claim.epoch, claim.instance)
-        if right and claim.tag != right:
+        claim = read_claim(self._by, self._keys, key)
+        if claim is None:
             self.unsigned += alive
-            self.changed.set()
-            return
-        with self._lock:
-            self._ignored.discard(claim)
-            self._highest_epoch = max(self._highest_epoch, claim.epoch)
-            (self._alive.add if alive else self._alive.discard)(claim)
+        elif claim.instance != self._instance:
+            with self._lock:
+                self._ignored.discard(claim)
+                self._highest_epoch = max(self._highest_epoch, claim.epoch)
+                (self._alive.add if alive else self._alive.discard)(claim)
         self.changed.set()
 
     def highest(self) -> Claim | None:
@@ -104,11 +104,6 @@ class Claims:
         """One more than any known epoch."""
         with self._lock:
             return self._highest_epoch + 1
-
-
-def claim_tag(authenticator: Authenticator, keys: Keys, epoch: int, instance: str) -> str:
-    """The tag of a claim, of which others repeat at most what was said; "" without a key."""
-    return authenticator.tag("claim", keys.claim(epoch, instance)).hex()
 
 
 # --- Whether an instance behind routers is connected to one of them.
@@ -150,7 +145,7 @@ class Reachability:
 
 #: Events of the serving instance after which its model no longer follows from the samples alone.
 MODEL_EVENTS: Final = frozenset({"selected", "rolled_back", "retuning_adopted"})
-#: Longest time for the transfer of the state, and pause before the next attempt, s.
+#: Longest wait for a part of the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
 #: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
@@ -192,7 +187,6 @@ class RoleControl:
     ) -> None:
         self.server = server
         self.claims = Claims(server.keys, server.instance, server.authenticator)
-        self._unsigned = 0
         #: When the instance that serves last gave a sign of life, by ``time.monotonic``, s, and its name.
         self._alive: tuple[str, float] = ("", 0.0)
         #: When a state was last asked for, by ``time.monotonic``, s.
@@ -203,7 +197,6 @@ class RoleControl:
         self._peer_files = peer_files
         self._reachability = reachability
         self._refusal = ""
-        self._pause_s = PAUSE_S
         self._session = session
         self._search_s = search_s
         self._stopping = False
@@ -307,7 +300,7 @@ class RoleControl:
             if highest is not None and highest > Claim(self._epoch, self.server.instance):
                 # Who does not answer queries is no successor.
                 if self._status_of(highest) is not None:
-                    self._stand_down(highest.instance)
+                    self._stand_down(highest)
             else:
                 self._check_rival(highest)
             return
@@ -320,18 +313,16 @@ class RoleControl:
             return
         self.settled.set()
         if self._outdated and (not self.server.synced or time.monotonic() - self._fetched_s >= _REFETCH_S):
-            self._take_state()
+            self._take_state(highest)
         self._check_alive(highest)
+
+    def _while_alive(self, other: Claim) -> Callable[[], bool]:
+        return lambda: not self._stopping and self.claims.highest() == other
 
     def _status_of(self, rival: Claim) -> dict[str, Any] | None:
         """The status of ``rival``; where it does not answer, its claim is ignored from now on."""
-        server = self.server
-
-        def wanted() -> bool:
-            return not self._stopping and self.claims.highest() == rival
-
-        key, instance = server.keys.status, rival.instance
-        status = status_of(self._session, key, instance, _LIFE_S, server.authenticator, wanted)
+        server, wanted = self.server, self._while_alive(rival)
+        status = status_of(self._session, server.keys.status, rival.instance, _LIFE_S, server.authenticator, wanted)
         if status is not None or not wanted() or self._reachability.is_cut_off():
             return status
         self.claims.ignore(rival)
@@ -349,13 +340,11 @@ class RoleControl:
             self._compare(status)
 
     def _note_unsigned(self) -> None:
-        """Note the first claim with a wrong tag; the others are counted."""
-        unsigned, before = self.claims.unsigned, self._unsigned
-        self._unsigned = unsigned
-        self.server.set_claims_refused(unsigned)
-        if unsigned and not before:
+        """Note the first claim that proves nothing; the others are counted."""
+        if self.claims.unsigned and not self.server.claims_refused:
             detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
             self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
+        self.server.set_claims_refused(self.claims.unsigned)
 
     def _check_rival(self, rival: Claim | None) -> None:
         """Claim again if a rival with a lower claim goes on serving.
@@ -379,8 +368,8 @@ class RoleControl:
         server, before = self.server, self._token
         self._epoch = max(self._epoch + 1, self.claims.next_epoch())
         server.set_epoch(self._epoch)
-        tag = claim_tag(server.authenticator, server.keys, self._epoch, server.instance)
-        self._token = self._session.liveliness().declare_token(server.keys.claim(self._epoch, server.instance, tag))
+        key = claim_key(server.authenticator, server.keys, Claim(self._epoch, server.instance))
+        self._token = self._session.liveliness().declare_token(key)
         if before is not None:
             before.undeclare()
 
@@ -396,17 +385,16 @@ class RoleControl:
         self.settled.set()
         self.ready.set()
 
-    def _stand_down(self, other: str) -> None:
+    def _stand_down(self, other: Claim) -> None:
         server = self.server
-        server.axis.note("stood_down", f"{other} serves: it took over while this instance was unreachable")
+        server.axis.note("stood_down", f"{other.instance} serves: it took over while this instance was unreachable")
         # First: the status must not claim that this is the served model.
         server.set_synced(False)
         server.stand_down()
         self._drop_claim()
         self._rival_at = None
         server.loop.queue.call(self._enter_standby, _CHANGE_S)
-        self._outdated = True
-        self._take_state()
+        self._take_state(other)
 
     def _apply_switch(self) -> None:
         """Freeze or thaw as the one before did last, if that was not yet in a state from it: it was answered."""
@@ -433,43 +421,37 @@ class RoleControl:
         self.server.leave_tuning()
         self.server.loop.set_gate(self.model.gate)
 
-    def _take_state(self) -> None:
+    def _take_state(self, serving: Claim) -> None:
         """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
         self._outdated = False  # a callback may set it again meanwhile
         taken = False
         try:
-            taken = self._fetch_and_restore()
+            taken = self._fetch_and_restore(serving)
         finally:
             self._outdated = self._outdated or not taken
 
-    def _fetch_and_restore(self) -> bool:
+    def _fetch_and_restore(self, serving: Claim) -> bool:
         self._fetched_s = time.monotonic()
+        server = self.server
         try:
-            by_key = self.server.authenticator
-            data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s, by_key)
-        except ServiceError as error:
-            if str(error) != self._refusal:
-                self.server.axis.note("standby_refused", str(error))
-            self._refusal = str(error)
-            return False
-        # After a failure on a busy machine the next transfer is slower.
-        self._pause_s = min(2.0 * self._pause_s, MAX_PAUSE_S)
-        if data is None:
-            return False
-        try:
-            self.server.loop.queue.call(lambda: self.model.take_state(data), _RESTORE_S)
+            key, wanted = server.keys.state, self._while_alive(serving)
+            data = fetch_state(self._session, key, _TRANSFER_S, server.authenticator, wanted)
+            if data is None:
+                return False
+            server.loop.queue.call(lambda: self.model.take_state(data), _RESTORE_S)
         except DehystError as error:
-            if str(error) != self._refusal:
-                self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
-            self._refusal = str(error)
+            refusal = f"the state of the serving instance: {error}"
+            if refusal != self._refusal:
+                server.axis.note("standby_refused", refusal)
+            self._refusal = refusal
             if isinstance(error, ModelFileError):
                 # Another configuration: this instance stays without the served model, and records samples.
                 self.ready.set()
             return False
         if not self._outdated:  # no verb came while it was sent
             self._switch = None
-        self._refusal, self._pause_s = "", PAUSE_S
-        self.server.set_synced(True)
+        self._refusal = ""
+        server.set_synced(True)
         self.ready.set()
         return True
 

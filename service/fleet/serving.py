@@ -169,7 +169,9 @@ class FleetService:
                 session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
                 session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
                 session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
-                session.declare_queryable(keys.operate, self._in_turn(keys.operate, self._operations.handle)),
+                session.declare_queryable(
+                    keys.operate, self._in_turn(keys.operate, self._operations.handle, self._operations.check)
+                ),
                 # Last, because alive means callable.
                 session.liveliness().declare_token(keys.alive(self.instance)),
             ):
@@ -216,18 +218,23 @@ class FleetService:
         if room:
             self._queue.put(batch)
 
-    def _answers(self, key: str, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
-        """A callback that counts and answers the queries to ``key`` by their payload."""
+    def _answers(
+        self, key: str, answer: Callable[[bytes], bytes], check: Callable[[zenoh.Query], None] = lambda _: None
+    ) -> Callable[[zenoh.Query], None]:
+        """A callback that counts and answers the queries to ``key`` by their payload, if ``check`` does not raise."""
 
         def counted(query: zenoh.Query) -> bytes:
             self._count(queries=1)
+            check(query)
             return answer(query.payload.to_bytes() if query.payload is not None else b"")
 
         return guarded(key, counted, lambda _: self._count(query_errors=1), authenticator=self._by)
 
-    def _in_turn(self, key: str, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
+    def _in_turn(
+        self, key: str, answer: Callable[[bytes], bytes], check: Callable[[zenoh.Query], None] = lambda _: None
+    ) -> Callable[[zenoh.Query], None]:
         """The same in the thread that learns, because it reads the learners."""
-        callback = self._answers(key, answer)
+        callback = self._answers(key, answer, check)
         return lambda query: self._queue.put(lambda: callback(query))
 
     def _feedforward(self, payload: bytes) -> bytes:

@@ -21,7 +21,7 @@ from service.protocol.errors import (
     error_from_json,
 )
 from service.protocol.keys import ROOT, Keys
-from service.security.authenticator import EVERYBODY, Authenticator, own_authenticator
+from service.security.authenticator import Authenticator, own_authenticator
 
 # --- Commands and statuses over the wire.
 
@@ -53,19 +53,15 @@ def operate(
     until = time.monotonic() + _SETTLE_S
     while True:
         error: bytes | None = None
-        question, unsigned = by.question(payload=payload), 0
-        for reply in session.get(
-            keys.operate, payload=payload, timeout=timeout_s, attachment=question.attachment, **EVERYBODY
-        ):
-            if reply.ok is not None:
-                if (signed := question.answer(reply.ok)) is None:
-                    unsigned += 1
-                    continue
+        unsigned = 0
+        for reply, signed in by.ask(session, keys.operate, timeout_s, payload=payload, sign=True):
+            if signed is not None:
                 answer = json.loads(signed.payload)
                 if not isinstance(answer, dict) or answer.get("ok") is not True:
                     raise FieldError("answer", repr(answer)[:80], "an answer of this version")
                 return answer
-            elif reply.err is not None:
+            unsigned += reply.ok is not None
+            if reply.err is not None:
                 error = error or reply.err.payload.to_bytes()
         if unsigned and error is None:
             raise UnsignedReplyError(f"{keys.operate}: {unsigned} replies, none with the authenticator by {by.path}")
@@ -92,15 +88,8 @@ def statuses(
     """
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     by = own_authenticator() if authenticator is None else authenticator
-    question = by.question()
-    # Two instances reply on one key; consolidation would drop one of them.
-    for reply in session.get(
-        f"{ROOT}/{stage}/{axis}/status", timeout=timeout_s, attachment=question.attachment, **EVERYBODY
-    ):
-        signed = None if reply.ok is None else question.answer(reply.ok)
-        if signed is None:
-            continue
-        status = fields_of(signed.payload)
+    for _, signed in by.ask(session, f"{ROOT}/{stage}/{axis}/status", timeout_s):
+        status = {} if signed is None else fields_of(signed.payload)
         if all(name in status for name in ("stage", "axis", "instance")):
             found[str(status["stage"]), str(status["axis"]), str(status["instance"])] = status
     return in_order(found.values())

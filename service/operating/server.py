@@ -227,7 +227,7 @@ class OperationsServer:
     tell : tells the standbys of a freeze or thaw, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
-    authenticator : signs the answers.
+    authenticator : signs the answers, and tells the requests that carry the key.
     """
 
     def __init__(
@@ -260,12 +260,12 @@ class OperationsServer:
         self._more_turned_away = 0
         self._counting = threading.Lock()
         self._replayed = replayed
-        self._counts = {"done": 0, "refused": 0}
+        self._counts = {"done": 0, "refused": 0, "unsigned": 0}
         self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
 
     def counters(self) -> dict[str, int]:
-        """For the status: requests done, requests refused, and operations missing in the journal."""
+        """For the status: requests done, refused, and without the key; operations missing in the journal."""
         return {**self._counts, "unlogged": self._journal.lost}
 
     def declare(self, session: zenoh.Session) -> list[Any]:
@@ -284,6 +284,18 @@ class OperationsServer:
             self._queue.put(_STOP)
             self._thread.join()
             self._thread = None
+
+    def check(self, query: zenoh.Query) -> None:
+        """Refuse a request without the authenticator of this service, or with one that came before: InputError."""
+        if self._by.is_asked_by_ours(query, self._keys.operate):
+            return
+        if not self._counts["unsigned"]:
+            detail = "a request without the authenticator of this service is refused; later ones are only counted"
+            self._note("operation_refused", detail)
+        self._counts["unsigned"] += 1
+        got = "none" if query.attachment is None else "a wrong one, or one that came before"
+        advice = "name the service's key (--key, DEHYST_KEY); see docs/access.md"
+        raise FieldError("authenticator", got, "one by the key of this service, new for each request", advice)
 
     def handle(self, payload: bytes | None) -> bytes:
         """Run the command in a payload and record it; returns the reply. Raises DehystError if it is refused."""
@@ -344,6 +356,10 @@ class OperationsServer:
             self._refuse(query, FieldError("payload", f"{len(query.payload)} bytes", f"at most {MAX_BYTES} bytes"))
             return
         try:
+            self.check(query)
+        except DehystError as unsigned:
+            return _reply_error(query, unsigned)
+        try:
             payload = None if query.payload is None else query.payload.to_bytes()
             self._queue.put_nowait((query, payload))
         except queue.Full:
@@ -359,8 +375,7 @@ class OperationsServer:
 
     def _refuse(self, query: zenoh.Query, error: BaseException) -> None:
         self._counts["refused"] += 1
-        with query:
-            query.reply_err(error_to_json(error), encoding=JSON)
+        _reply_error(query, error)
 
     def _run(self, waiting: queue.Queue[tuple[zenoh.Query, bytes | None] | None]) -> None:
         while (item := waiting.get()) is not _STOP:
@@ -375,3 +390,8 @@ class OperationsServer:
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
             self._write_turned_away()
+
+
+def _reply_error(query: zenoh.Query, error: BaseException) -> None:
+    with query:
+        query.reply_err(error_to_json(error), encoding=JSON)

@@ -43,18 +43,29 @@ def stored_kind(model: InverseModel) -> str:
     )
 
 
+#: Entries of a model that may change without any change of its answers.
+_UNANSWERED: Final = frozenset({"seq", "valid", "noise_variance"})
+
+
+def fingerprint(model: InverseModel, whole: bool = False) -> str:
+    """16 hexadecimal digits; equal for models that give the same answers to the last bit.
+
+    ``whole`` : equal only where all parameters are the same.
+    """
+    made = hashlib.blake2b(digest_size=8)
+    for entry, value in sorted(model.state_dict().items()):
+        if entry in _UNANSWERED and not whole:
+            continue
+        array = value if isinstance(value, np.ndarray) else None
+        told = [entry, value] if array is None else [entry, array.dtype.str, array.shape]
+        made.update(json.dumps(told).encode())
+        made.update(b"" if array is None else array.tobytes())
+    return made.hexdigest()
+
+
 def digests(models: Mapping[str, InverseModel]) -> dict[str, str]:
-    """16 hexadecimal digits over all parameters of each model, by name: equal where it is the same to the last bit."""
-    found = {}
-    for name, model in models.items():
-        made = hashlib.blake2b(digest_size=8)
-        for entry, value in sorted(model.state_dict().items()):
-            array = value if isinstance(value, np.ndarray) else None
-            told = [entry, value] if array is None else [entry, array.dtype.str, array.shape]
-            made.update(json.dumps(told).encode())
-            made.update(b"" if array is None else array.tobytes())
-        found[name] = made.hexdigest()
-    return found
+    """The fingerprint of each whole model, by name."""
+    return {name: fingerprint(model, whole=True) for name, model in models.items()}
 
 
 def build_model(kind: str, state: StateDict, where: str) -> InverseModel:

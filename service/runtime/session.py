@@ -72,9 +72,6 @@ _STUCK_S: Final = 0.3
 #: The same by mode, s. A client has a single connection, so nothing else waits behind it. At a router the time must be
 #: shorter than the lease: when a subscriber comes or goes, all keep-alive messages wait behind a slow one.
 _BLOCKED_S: Final = {"peer": _STUCK_S, "router": _STUCK_S, "client": 5.0}
-#: Packets of 64 KiB that may wait at the priority of a state transfer to a standby. Zenoh's default of two is full, and
-#: the next part lost, as soon as the sending thread waits a few milliseconds for a processor.
-_STATE_PACKETS: Final = 16
 #: Longest message that is reassembled from fragments, bytes: the largest model plus a margin. With zenoh's default of
 #: 1 GiB any sender could make the service allocate that much.
 MAX_MESSAGE_BYTES: Final = 72 * 2**20
@@ -192,7 +189,6 @@ def _open(
         "transport/unicast/open_timeout": round(1e3 * _OPEN_S),
         # A receiver that reads nothing for this long is disconnected, so that others need not wait behind it; µs.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * _BLOCKED_S[mode]),
-        "transport/link/tx/queue/size/data_low": _STATE_PACKETS,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2},
     }
     for key, value in settings.items():

@@ -19,7 +19,9 @@ import os
 import secrets
 import struct
 import threading
+import time
 from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -39,6 +41,8 @@ _LENGTH: Final = struct.Struct("<Q").pack
 #: Stamps of queries, and senders of samples, that are remembered.
 _REMEMBERED: Final = 65_536
 _SENDERS: Final = 16
+#: Pause between two looks for a reply, s.
+_POLL_S: Final = 0.001
 #: Options of `zenoh.Session.get`: the caller gets the replies of all instances, not the first one alone.
 EVERYBODY: Final[dict[str, Any]] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
 
@@ -135,6 +139,40 @@ class Authenticator:
         """What a query carries, and the check of its replies; signed for ``key`` where one is given."""
         return Question(self, parameters, payload, key)
 
+    def ask(
+        self,
+        session: zenoh.Session,
+        key: str,
+        timeout_s: float,
+        parameters: str = "",
+        payload: bytes = b"",
+        sign: bool = False,
+        wanted: Callable[[], bool] = lambda: True,
+        **options: Any,
+    ) -> Iterator[tuple[zenoh.Reply, Signed | None]]:
+        """Ask all instances; each reply that comes within ``timeout_s``, and what it says if its tag is right.
+
+        ``sign`` : the query too. Ends when ``wanted`` is false. ``options`` : of `zenoh.Session.get`.
+        """
+        question = self.question(parameters, payload, key if sign else "")
+        replies = session.get(
+            f"{key}?{parameters}" if parameters else key,
+            payload=payload or None,
+            attachment=question.attachment,
+            timeout=timeout_s,
+            **EVERYBODY,
+            **options,
+        )
+        while wanted():
+            try:
+                reply = replies.try_recv()
+            except zenoh.ZError:
+                return  # all have answered, or the time is over
+            if reply is None:
+                time.sleep(_POLL_S)
+            else:
+                yield reply, None if reply.ok is None else question.answer(reply.ok)
+
     def heard(self, sample: zenoh.Sample, key: str) -> Signed | None:
         """A publication on ``key``; None without a right tag."""
         payload = sample.payload.to_bytes()
@@ -209,6 +247,27 @@ class Heard:
         return signed.payload
 
 
+class Rising:
+    """The highest number of each of the last senders: each of their messages counts once, in order."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[bytes, int] = OrderedDict()
+
+    def __bool__(self) -> bool:
+        return bool(self._last)
+
+    def take(self, stamp: bytes) -> bool:
+        """Whether a message with this stamp is newer than all earlier ones of its sender."""
+        sender, number = _split(stamp)
+        if number <= self._last.get(sender, -1):
+            return False
+        self._last[sender] = number
+        self._last.move_to_end(sender)
+        if len(self._last) > _SENDERS:
+            self._last.popitem(last=False)
+        return True
+
+
 class HeardSamples:
     """Samples of a stage on ``key``: from the first signed one on, only signed ones, each message once.
 
@@ -217,28 +276,18 @@ class HeardSamples:
 
     def __init__(self, authenticator: Authenticator, key: str) -> None:
         self.refused = 0
-        self._by, self._key = authenticator, key
-        self._last: OrderedDict[bytes, int] = OrderedDict()
+        self._by, self._key, self._rising = authenticator, key, Rising()
 
     def take(self, sample: zenoh.Sample) -> bytes | None:
         """The payload of a message; None where it is refused, or repeated."""
         signed = self._by.heard(sample, self._key)
         if signed is None:
-            if not self._last:
+            if not self._rising:
                 return sample.payload.to_bytes()
-            self.refused += 1
-            return None
-        if not self._by:
+        elif not self._by or self._rising.take(signed.stamp):
             return signed.payload
-        sender, number = _split(signed.stamp)
-        if number <= self._last.get(sender, 0):
-            self.refused += 1
-            return None
-        self._last[sender] = number
-        self._last.move_to_end(sender)
-        if len(self._last) > _SENDERS:
-            self._last.popitem(last=False)
-        return signed.payload
+        self.refused += 1
+        return None
 
 
 def payload_of(data: zenoh.ZBytes | None) -> bytes:

@@ -24,7 +24,7 @@ import zenoh
 from service.protocol.errors import CommandHeldError
 from service.protocol.keys import Keys
 from service.runtime.session import LEASE_S, SURELY
-from service.security.authenticator import SENDER, STAMP, Authenticator, payload_of
+from service.security.authenticator import SENDER, STAMP, Authenticator, Rising, payload_of
 
 _LOGGER: Final = logging.getLogger("dehyst.security")
 _KEY: Final = re.compile(
@@ -131,7 +131,7 @@ class CommandGate(Holders):
         self.foreign = 0
         self.stranger = ""
         self._receive = receive
-        self._last = ("", -1)
+        self._rising = Rising()
         self._warned: Holder | None = None
         #: Each link of the session has a thread of its own.
         self._one = threading.Lock()
@@ -162,14 +162,11 @@ class CommandGate(Holders):
             return "a controller without a token"
         if not self._by.proves(attached[STAMP:], "put", self._keys.command, stamp, payload):
             return "a controller without the key"
-        sender, number = stamp[:SENDER].hex(), int.from_bytes(stamp[SENDER:], "little")
+        sender = stamp[:SENDER].hex()
         if owner is not None and sender != owner.sender:
             known = (str(holder) for holder in self.alive if holder.sender == sender)
             return next(known, f"controller {sender}, which holds no token")
-        if self._last[0] == sender and number <= self._last[1]:
-            return "somebody who repeats the owner's"
-        self._last = sender, number
-        return ""
+        return "" if self._rising.take(stamp) else "somebody who repeats the owner's"
 
     def to_json(self) -> dict[str, Any]:
         """Of the tokens, and ``foreign`` and ``stranger``."""

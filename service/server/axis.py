@@ -31,7 +31,7 @@ from service.intake.command_witness import CommandWitness
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
-from service.protocol.model import Safety, digests, stored_kind
+from service.protocol.model import Safety, digests, fingerprint, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
@@ -45,7 +45,6 @@ from service.server.learner_supervisor import (
     Revive,
     blend_share_of,
     champion_of,
-    fingerprint,
     stored_model,
 )
 from service.server.moves import Moves

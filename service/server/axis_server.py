@@ -57,6 +57,7 @@ class AxisServer:
     ----------
     role : "primary" while it serves, else "standby". epoch : number of its take-over, see `RoleControl`.
     synced : whether the model is the one to be served: its own, or, of a standby, that of the serving instance.
+    claims_refused : count of claims of others that prove nothing.
     loop : the thread of the axis. checkpoints : writes them.
     """
 
@@ -80,7 +81,6 @@ class AxisServer:
         self.role = STANDBY
         self.synced = True
         self.epoch = 0
-        #: Claims of others that prove nothing.
         self.claims_refused = 0
         #: Count of all samples when the last command was applied.
         self._operated_at = 0

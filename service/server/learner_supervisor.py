@@ -6,7 +6,6 @@ decide alike.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -125,7 +124,7 @@ class ModelWatchConfig:
     unseen_s: float = 0.1
     last_good_s: float = 60.0
     ramp_s: float = 1.0
-    silent_s: float = 2.0
+    silent_s: float = 0.5
     revive_s: float = 5.0
 
 
@@ -324,7 +323,7 @@ def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
         return np.full(y_um.size, math.nan)
 
 
-# --- Stored states of a learner, and the fingerprint of a model.
+# --- Stored states of a learner.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
 STATE_SCHEMA: Final = 5
@@ -363,18 +362,6 @@ class SupervisorEntries:
     frozen_by: Annotated[str, Entry("who has stopped learning, empty for nobody", most=1000)]
     dead: Annotated[bool, Entry("whether the learner has failed")]
     adoptions: Annotated[str, Entry("hyper-parameters that wait for their sample, as JSON")]
-
-
-def fingerprint(model: InverseModel) -> str:
-    """16 hexadecimal digits; equal for models that give the same answers to the last bit."""
-    sha = hashlib.blake2b(digest_size=8)
-    for name, value in sorted(model.state_dict().items()):
-        # These may change without any change of the answers.
-        if name in ("seq", "valid", "noise_variance"):
-            continue
-        sha.update(name.encode())
-        sha.update(value.tobytes() if isinstance(value, np.ndarray) else json.dumps(value).encode())
-    return sha.hexdigest()
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
@@ -14,7 +16,7 @@ import zenoh
 
 from adaptive.errors import DehystError
 from service.answers.slices import Pace
-from service.failover.state_transfer import send_state
+from service.failover.state_transfer import part_of
 from service.protocol.container import JSON, to_json
 from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
@@ -78,8 +80,9 @@ _COPIED_BYTES: Final = 65_536
 _POINT_BYTES: Final = 16
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02
-#: States that are sent at the same time at most.
+#: States that are copied at the same time at most, and copies that are kept until their last part is sent.
 _MOST_STATES: Final = 4
+_TRANSFER, _PART = re.compile("[0-9a-f]{1,64}"), re.compile("[0-9]{1,6}")
 
 
 class QueryAnswers:
@@ -117,7 +120,9 @@ class QueryAnswers:
         self._long = long_queries
         self._by = authenticator
         self.states_refused = 0
-        self._sends = threading.BoundedSemaphore(_MOST_STATES)
+        self._copies = threading.BoundedSemaphore(_MOST_STATES)
+        #: By the name that the asking instance gave the transfer, the oldest first.
+        self._states: OrderedDict[str, bytes] = OrderedDict()
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Answer from now on; returns what is to be undeclared."""
@@ -196,7 +201,7 @@ class QueryAnswers:
     def _refuse(self, query: zenoh.Query, error: BaseException) -> None:
         """Reply with an error; nothing where the caller is gone or an answer was sent."""
         if not isinstance(error, DehystError | zenoh.ZError):
-            self._axis.note("internal_error", f"{self._keys.feedforward}: {type(error).__name__}: {error}")
+            self._axis.note("internal_error", f"{query.key_expr}: {type(error).__name__}: {error}")
         with contextlib.suppress(zenoh.ZError), query:
             query.reply_err(error_to_json(error), encoding=JSON)
 
@@ -211,36 +216,48 @@ class QueryAnswers:
         return to_json(self._status())
 
     def _on_state(self, query: zenoh.Query) -> None:
-        """Reply from a thread of its own: the copy of the state waits for the learner, and a callback must not."""
-
-        def reply() -> None:
-            # The asking standby gets samples from its connection on: the state must contain all that came before.
-            time.sleep(_ROUTING_S)
-            with query:
-                try:
-                    send_state(query, self._keys.state, self._state_buffers(), self._by)
-                except Exception as error:
-                    query.reply_err(error_to_json(error), encoding=JSON)
-                finally:
-                    self._sends.release()
-
+        """Reply with a part of the state; the first one copies it, from a thread of its own: it waits for the learner,
+        and a callback must not."""
         try:
-            check_parameters(query.parameters, "pause_s")
+            check_parameters(query.parameters, "transfer", "part")
             # First: strangers must not keep the places of instances, or have a thread each.
             if not self._by.is_asked_by_ours(query, self._keys.state):
                 self.states_refused += 1
                 raise ServiceError("the state is for instances of this service: sign the query, each time anew")
-            if not self._sends.acquire(blocking=False):
-                raise ServiceError(f"{_MOST_STATES} states are being sent: ask again later")
+            transfer, part = (query.parameters.get(name) or "" for name in ("transfer", "part"))
+            if not (_TRANSFER.fullmatch(transfer) and _PART.fullmatch(part)):
+                raise FieldError("transfer, part", f"{transfer!r}, {part!r}"[:80], "1 to 64 of 0-9 a-f, and a number")
+            if (state := self._states.get(transfer)) is not None:
+                self._send_part(query, transfer, state, int(part))
+            elif int(part):
+                raise ServiceError("the copy of this state is no longer kept: begin another transfer")
+            elif not self._copies.acquire(blocking=False):
+                raise ServiceError(f"{_MOST_STATES} states are being copied: ask again later")
+            else:
+                copy = partial(self._copy_state, query, transfer)
+                threading.Thread(target=copy, name=f"state-{self._keys.axis}", daemon=True).start()
         except Exception as error:
-            with query:
-                query.reply_err(error_to_json(error), encoding=JSON)
-            return
-        threading.Thread(target=reply, name=f"state-{self._keys.axis}", daemon=True).start()
+            self._refuse(query, error)
 
-    def _state_buffers(self) -> Iterator[Any]:
-        """The buffers of the present state, copied when the first one is asked for."""
-        yield from encode_checkpoint(*self._checkpoints.state())
+    def _copy_state(self, query: zenoh.Query, transfer: str) -> None:
+        try:
+            # The asking standby gets samples from its connection on: the state must contain all that came before.
+            time.sleep(_ROUTING_S)
+            state = self._states[transfer] = b"".join(encode_checkpoint(*self._checkpoints.state()))
+            while len(self._states) > _MOST_STATES:
+                self._states.popitem(last=False)
+            self._send_part(query, transfer, state, 0)
+        except Exception as error:
+            self._refuse(query, error)
+        finally:
+            self._copies.release()
+
+    def _send_part(self, query: zenoh.Query, transfer: str, state: bytes, number: int) -> None:
+        key, (part, count) = self._keys.state, part_of(state, number)
+        if number == count - 1:
+            self._states.pop(transfer, None)
+        with query:
+            query.reply(key, part, attachment=self._by.answered(query, key, part))
 
     def _guarded(
         self, key: str, answer: Callable[[zenoh.Query], bytes], parameters: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ import zenoh
 
 from service.protocol.container import JSON, to_json
 from service.protocol.keys import AUTO, Keys
-from service.protocol.model import stored_kind
+from service.protocol.model import fingerprint, stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed
@@ -23,7 +23,6 @@ from service.security.refusals import refusal_counters
 from service.server.axis_loop import AxisLoop
 from service.server.deltas import DeltaStreams
 from service.server.health import Health
-from service.server.learner_supervisor import fingerprint
 from service.server.query_answers import LatencyMeter, QueryAnswers
 
 # --- The status of one axis, as JSON; docs/protocol.md lists the fields.

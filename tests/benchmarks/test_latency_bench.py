@@ -17,7 +17,7 @@ from benchmarks.exactness import differing, offline_state, taught
 from benchmarks.latency import TRAJECTORY, latency, page
 from benchmarks.sample_feed import AXIS, STAGE, sent
 from service.config.settings import AxisConfig
-from service.server.learner_supervisor import fingerprint
+from service.protocol.model import fingerprint
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, make_models
 

@@ -26,7 +26,6 @@ def demo(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, "-m", "lab.cli", "demo", "--out", str(out), "--duration", str(DURATION_S), *options],
         capture_output=True,
         text=True,
-        timeout=170,
         check=False,
     )
 

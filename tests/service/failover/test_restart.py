@@ -19,10 +19,10 @@ import pytest
 
 from service.client.client import Client
 from service.config.settings import read_config
+from service.protocol.model import fingerprint
 from service.protocol.query import STALE
 from service.runtime.session import open_client, open_service
 from service.server.axis_loading import load_axis
-from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from sim.recordings import read

@@ -17,10 +17,10 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.role_control import Claim, Claims, claim_tag, parse_claim
+from service.failover.role_control import Claim, Claims, claim_key, read_claim
 from service.protocol.keys import Keys
 from service.runtime.session import open_client
-from service.security.authenticator import own_authenticator
+from service.security.authenticator import NO_KEY, own_authenticator
 from sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
@@ -146,18 +146,17 @@ def test_who_serves_claims_anew_where_another_goes_on_serving(tmp_path: Path, pr
     processes.append(Process("serve", "--config", str(config)))
     instance = processes[0].ready["instance"]
     keys = Keys("demo", "x")
-    tag = claim_tag(own_authenticator(), keys, 0, "i0-deaf")
     heard: list[tuple[int, bool]] = []
 
     def on_claim(sample: zenoh.Sample) -> None:
-        claim = parse_claim(str(sample.key_expr))
+        claim = read_claim(NO_KEY, keys, str(sample.key_expr))
         if claim is not None and claim.instance == instance:
             heard.append((claim.epoch, sample.kind == zenoh.SampleKind.PUT))
 
     with open_client(endpoints, 20.0) as session, Client.connect(endpoints, wait_s=20.0) as client:
         session.liveliness().declare_subscriber(keys.claim_any, on_claim, history=True)
         eventually(lambda: heard == [(1, True)])
-        deaf = session.liveliness().declare_token(keys.claim(0, "i0-deaf", tag))
+        deaf = session.liveliness().declare_token(claim_key(own_authenticator(), keys, Claim(0, "i0-deaf")))
         eventually(lambda: len(heard) >= 5)
         deaf.undeclare()
         # Never without one: whoever stands by would take over.
@@ -321,7 +320,7 @@ def test_the_greatest_claim_serves() -> None:
     assert (claims.highest(), claims.next_epoch()) == (None, 3)
     claims.update("dehyst/v1/demo/x/alive/i-b", True)
     assert claims.highest() is None
-    assert parse_claim("x") is None
+    assert read_claim(NO_KEY, keys, "x") is None
     assert np.all([Claim(2, "a") > Claim(1, "z"), Claim(2, "b") > Claim(2, "a")])
 
 

@@ -10,13 +10,13 @@ import subprocess
 import sys
 import threading
 import time
-import tracemalloc
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 import zenoh
 
-from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, joined, send_state
+from service.failover.state_transfer import fetch_state, part_of
+from service.protocol.errors import FieldError
 from service.runtime.session import open_client, open_router
 from tests.service.conftest import unused_port
 
@@ -43,149 +43,92 @@ def endpoint() -> Iterator[str]:
         yield endpoint
 
 
-def placed(*places: tuple[int, int]) -> list[bytes]:
-    return [struct.pack("<II", *place) + b"x" for place in places]
+def test_the_parts_are_the_whole_and_smaller_than_a_packet() -> None:
+    for size in (0, 1, 57_344, 57_345, 200_000):
+        state = STATE[:size]
+        _, count = part_of(state, 0)
+        parts = [part_of(state, i)[0] for i in range(count)]
+        assert b"".join(part[4:] for part in parts) == state
+        assert all(len(part) < 65_000 and part[:4] == struct.pack("<I", count) for part in parts)
+        for wrong in (-1, count):
+            with pytest.raises(FieldError, match="part"):
+                part_of(state, wrong)
 
 
-def join_parts(parts: Iterable[bytes]) -> bytes | None:
-    """The whole that one sender's parts make."""
-    return next(joined(("a", part) for part in parts), None)
+class Sender:
+    """Answers for the state as an instance does; may lose replies. ``asked`` : the numbers of the parts, in order."""
 
+    def __init__(self, state: bytes = STATE, lose: Callable[[int], bool] = lambda _: False) -> None:
+        self.asked: list[int] = []
+        self._state, self._lose = state, lose
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [],
-        [b""],
-        [b"\0" * 7],
-        [b"\0" * 9],
-        placed((0, 0)),
-        placed((0, 2)),
-        placed((1, 2)),
-        placed((0, 2), (0, 2)),
-        placed((0, 2), (1, 3), (2, 3)),
-        placed((1, 1)),
-        [struct.pack("<II", 0, 1) + b"x" * 60_000],
-    ],
-)
-def test_parts_that_make_no_whole_are_refused(parts: list[bytes]) -> None:
-    assert join_parts(placed((0, 3), (1, 3), (2, 3))) == b"xxx"
-    assert join_parts(parts) is None
-
-
-def test_what_is_whole_is_not_waited_with() -> None:
-    def parts() -> Iterator[bytes]:
-        yield from placed((0, 2), (1, 2))
-        raise AssertionError("the end may be lost")
-
-    assert join_parts(parts()) == b"xx"
-
-
-def test_nobody_fills_the_memory_of_the_one_that_asks() -> None:
-    def without_end() -> Iterator[bytes]:
-        for i in itertools.count():
-            yield struct.pack("<II", i, 2**32 - 1) + bytes(50_000)
-
-    tracemalloc.start()
-    assert join_parts(without_end()) is None
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1_000_000
-
-
-def test_what_a_stranger_sends_between_spoils_nothing_for_the_one_that_serves() -> None:
-    honest = [("a", part) for part in placed((0, 3), (1, 3), (2, 3))]
-    other = [("b", part) for part in placed((0, 2), (1, 2))]
-    rubbish = [("c", b"x"), ("d", struct.pack("<II", 0, 2**32 - 1) + b"x")]
-    mixed = [*rubbish, other[0], honest[0], honest[1], other[1], honest[2]]
-    assert list(joined(mixed)) == [b"xx", b"xxx"]
-    crowd = [(str(k), placed((0, 2))[0]) for k in range(50)]
-    assert list(joined([honest[0], *crowd, *honest[1:]])) == [b"xxx"]
-
-
-def test_senders_of_nothing_but_rubbish_are_not_heard_for_ever() -> None:
-    def without_end() -> Iterator[tuple[str, bytes]]:
-        while True:
-            yield "c", b"x"
-
-    begin = time.monotonic()
-    assert list(joined(without_end())) == []
-    assert time.monotonic() - begin < 5.0
-
-
-def in_a_thread(query: zenoh.Query) -> None:
-    def reply() -> None:
+    def __call__(self, query: zenoh.Query) -> None:
         with query:
-            send_state(query, KEY, [STATE[:1000], STATE[1000:]])
-
-    threading.Thread(target=reply).start()
-
-
-def asked(session: zenoh.Session, pause_s: float) -> bytes | None:
-    """What arrives when asked for as a standby does: a part may be lost, and more slowly the next time it comes."""
-    for _ in range(6):
-        data = fetch_state(session, KEY, 5.0, pause_s)
-        if data is not None:
-            return data
-        pause_s = max(PAUSE_S, min(2.0 * pause_s, MAX_PAUSE_S))
-    return None
+            number = int(query.parameters.get("part", ""))
+            self.asked.append(number)
+            if not self._lose(len(self.asked)):
+                query.reply(KEY, part_of(self._state, number)[0])
 
 
-def test_it_arrives_whole_at_any_pace(endpoint: str) -> None:
+def test_it_arrives_whole(endpoint: str) -> None:
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
         assert fetch_state(asking, KEY, 1.0) is None
-        serving.declare_queryable(KEY, in_a_thread)
+        sender = Sender()
+        serving.declare_queryable(KEY, sender)
         time.sleep(0.2)
-        assert asked(asking, PAUSE_S) == STATE
-        assert asked(asking, 0.0) == STATE
-        begin = time.monotonic()
-        assert asked(asking, 0.008) == STATE
-        assert time.monotonic() - begin > 0.6
+        assert fetch_state(asking, KEY, 5.0) == STATE
+        assert sender.asked == list(range(82))
 
 
-@pytest.mark.parametrize("pause", ["", "nan", "-1", "1e9", "soon"])
-def test_any_pace_can_be_asked_for_and_is_kept_within_reason(endpoint: str, pause: str) -> None:
+def test_a_part_that_is_lost_is_asked_for_again(endpoint: str) -> None:
+    """One message, or parts that come by themselves, would have to begin anew."""
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        serving.declare_queryable(KEY, in_a_thread)
+        sender = Sender(STATE[:500_000], lambda count: count % 4 == 2)
+        serving.declare_queryable(KEY, sender)
         time.sleep(0.2)
-        replies = asking.get(f"{KEY}?pause_s={pause}", timeout=5.0, consolidation=zenoh.ConsolidationMode.NONE)
-        parts = [reply.ok.payload.to_bytes()[8:] for reply in replies if reply.ok is not None]
-        assert b"".join(parts) == STATE
+        assert fetch_state(asking, KEY, 5.0) == STATE[:500_000]
+        assert list(dict.fromkeys(sender.asked)) == list(range(9))
+        assert len(sender.asked) > 9
 
 
-@pytest.mark.parametrize("lost", [0, 3, 81, None])
-@pytest.mark.parametrize("ended", [True, False])
-def test_a_part_that_is_missing_is_noticed(endpoint: str, lost: int | None, ended: bool) -> None:
-    """Or one that says nothing of its place: who answers is of another release. At once, though the end is lost too."""
-    kept: list[zenoh.Query] = []
-
-    class Lossy:
-        def __init__(self, query: zenoh.Query) -> None:
-            self.query, self.sent = query, 0
-
-        def reply(self, key: str, part: bytes, attachment: bytes | None) -> None:
-            if self.sent != lost:
-                self.query.reply(key, part[8:] if lost is None else part, attachment=attachment)
-            self.sent += 1
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(self.query, name)
-
-    def answer(query: zenoh.Query) -> None:
-        send_state(Lossy(query), KEY, [STATE])  # type: ignore[arg-type]
-        if ended:
-            query.drop()
-        else:
-            kept.append(query)
-
+@pytest.mark.parametrize("lost_from", [1, 4])
+def test_who_stops_sending_is_not_waited_for(endpoint: str, lost_from: int) -> None:
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        serving.declare_queryable(KEY, answer)
+        serving.declare_queryable(KEY, Sender(STATE, lambda count: count >= lost_from))
         time.sleep(0.2)
         begin = time.monotonic()
         assert fetch_state(asking, KEY, 20.0) is None
-        assert time.monotonic() - begin < 10.0
-        for query in kept:
-            query.drop()
+        assert time.monotonic() - begin < 5.0
+
+
+def test_it_ends_when_the_state_is_no_longer_wanted(endpoint: str) -> None:
+    """As when the one that serves has gone while it sends: the standby must take over."""
+    held: list[zenoh.Query] = []
+    with open_client(endpoint) as serving, open_client(endpoint) as asking:
+        serving.declare_queryable(KEY, held.append)
+        time.sleep(0.2)
+        begin = time.monotonic()
+        assert fetch_state(asking, KEY, 20.0, wanted=lambda: time.monotonic() < begin + 0.3) is None
+        assert time.monotonic() - begin < 2.0
+        held.clear()
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"abc", struct.pack("<I", 1) + bytes(60_000), struct.pack("<I", 2**32 - 1) + b"x"]
+)
+def test_what_is_no_part_fills_no_memory(endpoint: str, said: bytes) -> None:
+    with open_client(endpoint) as serving, open_client(endpoint) as asking:
+        asked: list[int] = []
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                asked.append(1)
+                query.reply(KEY, said)
+
+        serving.declare_queryable(KEY, answer)
+        time.sleep(0.2)
+        assert fetch_state(asking, KEY, 5.0) is None
+        assert len(asked) == 1
 
 
 @pytest.mark.alone
@@ -211,7 +154,7 @@ def test_who_reads_slowly_makes_nobody_wait(endpoint: str) -> None:
     assert asker.stdout is not None
     try:
         with open_client(endpoint) as serving, open_client(endpoint) as stage, open_client(endpoint) as client:
-            serving.declare_queryable(KEY, in_a_thread)
+            serving.declare_queryable(KEY, Sender())
             serving.declare_queryable(ECHO, lambda query: (query.reply(ECHO, bytes(100)), query.drop()))
             heard = client.declare_subscriber(SAMPLES, lambda _: came.append(time.monotonic()))
             assert asker.stdout.readline() == "ready\n"

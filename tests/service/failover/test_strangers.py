@@ -15,8 +15,8 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.role_control import MAX_EPOCH, Claim, Claims, claim_tag, parse_claim
-from service.failover.state_transfer import fetch_state, send_state, status_of, tell_standbys
+from service.failover.role_control import MAX_EPOCH, Claim, Claims, claim_key, read_claim
+from service.failover.state_transfer import fetch_state, part_of, status_of, tell_standbys
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_router
@@ -29,6 +29,11 @@ KEYS = Keys("demo", "x")
 OURS, THEIRS = Authenticator(b"0123456789abcdef"), Authenticator(b"a stranger's own one")
 STATE = os.urandom(200_000)
 LIFE = b'{"instance": "i-peer"}'
+
+
+def send_part(query: zenoh.Query, by: Authenticator) -> None:
+    part, _ = part_of(STATE, int(query.parameters.get("part", "")))
+    query.reply(KEYS.state, part, attachment=by.answered(query, KEYS.state, part))
 
 
 @pytest.fixture
@@ -51,20 +56,20 @@ def test_a_claim_with_a_wrong_tag_or_an_absurd_epoch_is_none() -> None:
     for key in (
         KEYS.claim(9, "i-rogue"),
         KEYS.claim(9, "i-rogue", "00"),
-        KEYS.claim(9, "i-rogue", claim_tag(THEIRS, KEYS, 9, "i-rogue")),
-        KEYS.claim(9, "i-rogue", claim_tag(OURS, KEYS, 8, "i-rogue")),
-        KEYS.claim(9, "i-rogue", claim_tag(OURS, Keys("demo", "y"), 9, "i-rogue")),
+        claim_key(THEIRS, KEYS, Claim(9, "i-rogue")),
+        claim_key(OURS, KEYS, Claim(8, "i-rogue")).replace("/8/", "/9/"),
+        claim_key(OURS, Keys("demo", "y"), Claim(9, "i-rogue")).replace("/y/", "/x/"),
     ):
         claims.update(key, True)
         assert claims.highest() is None
     assert claims.unsigned == 5
     assert claims.next_epoch() == 1
-    claims.update(KEYS.claim(3, "i-peer", claim_tag(OURS, KEYS, 3, "i-peer")), True)
+    claims.update(claim_key(OURS, KEYS, Claim(3, "i-peer")), True)
     assert claims.highest() == Claim(3, "i-peer")
     claims.ignore(Claim(3, "i-peer"))
     assert claims.highest() is None
     for epoch in ("²", "١", "-1", str(MAX_EPOCH + 1), "9" * 400, "1.5", ""):
-        assert parse_claim(f"{KEYS.base}/claim/{epoch}/i-a") is None
+        assert read_claim(NO_KEY, KEYS, f"{KEYS.base}/claim/{epoch}/i-a") is None
 
 
 def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> None:
@@ -74,17 +79,14 @@ def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> 
         refused: list[zenoh.Query] = []
 
         def answer(query: zenoh.Query) -> None:
-            def send() -> None:
-                with query:
-                    attached = b"" if query.attachment is None else query.attachment.to_bytes()
-                    asked.append((str(query.parameters), attached))
-                    if by[0].is_asked_by_ours(query, KEYS.state):
-                        send_state(query, KEYS.state, [STATE], by[0])
-                    else:
-                        refused.append(query)
-                        query.reply_err(b"no")
-
-            threading.Thread(target=send).start()
+            with query:
+                attached = b"" if query.attachment is None else query.attachment.to_bytes()
+                asked.append((str(query.parameters), attached))
+                if by[0].is_asked_by_ours(query, KEYS.state):
+                    send_part(query, by[0])
+                else:
+                    refused.append(query)
+                    query.reply_err(b"no")
 
         queryable = serving.declare_queryable(KEYS.state, answer)
         time.sleep(0.2)
@@ -130,16 +132,13 @@ def test_strangers_that_answer_for_the_state_keep_it_from_nobody(endpoint: str) 
 
     def begin(query: zenoh.Query) -> None:
         held.append(query)
-        query.reply(KEYS.state, struct.pack("<II", 0, 4) + bytes(50_000), attachment=bytes(32))
+        query.reply(KEYS.state, struct.pack("<I", 4) + bytes(50_000), attachment=bytes(32))
 
     def answer(query: zenoh.Query) -> None:
-        def send() -> None:
-            time.sleep(0.1)
-            with query:
-                assert OURS.is_asked_by_ours(query, KEYS.state)
-                send_state(query, KEYS.state, [STATE], OURS)
-
-        threading.Thread(target=send).start()
+        time.sleep(0.1)
+        with query:
+            assert OURS.is_asked_by_ours(query, KEYS.state)
+            send_part(query, OURS)
 
     with open_client(endpoint) as serving, open_client(endpoint) as asking, contextlib.ExitStack() as stack:
         for session in crowd:
@@ -149,7 +148,7 @@ def test_strangers_that_answer_for_the_state_keep_it_from_nobody(endpoint: str) 
         stack.callback(serving.declare_queryable(KEYS.state, answer).undeclare)
         time.sleep(0.2)
         assert fetch_state(asking, KEYS.state, 5.0, authenticator=OURS) == STATE
-        assert len(held) == len(crowd)
+        assert len(held) == 4 * len(crowd)  # parts
 
 
 def test_a_freeze_that_a_stranger_tells_again_is_none(endpoint: str) -> None:

@@ -34,6 +34,7 @@ from service.protocol.model import decode_model, digests
 from service.protocol.query import LIMITED_VOLTAGE
 from service.protocol.samples import SampleBatch
 from service.runtime.session import open_client
+from service.security.authenticator import Authenticator
 from service.server.axis_loading import load_axis
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.model_file import Bundle, BundleMeta, write_bundle
@@ -287,7 +288,11 @@ def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
                     operate(session, KEYS, "freeze", "alice", wrong)
             with pytest.raises(RefusedError, match="one of freeze, thaw, rollback"):
                 operate(session, KEYS, "select", "alice", {"axes": [1]})
-            assert status(session)["operations"] == {"done": 2, "refused": 5, "unlogged": 0}
+            stranger = Authenticator(b"a stranger's own one")
+            with pytest.raises(RefusedError, match="authenticator"):
+                operate(session, KEYS, "thaw", "mallory", {"axes": [9]}, authenticator=stranger)
+            assert status(session)["frozen"] == [5, 9]
+            assert status(session)["operations"] == {"done": 2, "refused": 5, "unsigned": 1, "unlogged": 0}
     finally:
         process.kill()
     lines = (tmp_path / "kept" / "operations.jsonl").read_text(encoding="utf-8").splitlines()

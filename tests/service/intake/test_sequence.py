@@ -27,10 +27,10 @@ from service.intake.sequence import (
 from service.intake.sequence import (
     MOST_CONFIRMATIONS as MOST,
 )
+from service.protocol.model import fingerprint
 from service.protocol.samples import MAX_SEQ, SampleBatch
 from service.replay import sequence
 from service.server.axis import Axis
-from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
 from sim.recordings import Recording
 from tests.service.axes import loop_of

@@ -31,7 +31,7 @@ from service.protocol import samples as wire
 from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_service
-from service.security.authenticator import NO_KEY, own_authenticator
+from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
 from tests.service.living import eventually
 
 KEYS = Keys("demo", "x")
@@ -95,6 +95,12 @@ def ask(verb: str, who: str = "alice", **arguments: Any) -> bytes:
     return encode_request(Request(verb, who, arguments))
 
 
+def request(client: zenoh.Session, payload: bytes | None) -> Any:
+    """The replies to a request that carries the key."""
+    attachment = own_authenticator().question(payload=payload or b"", key=KEYS.operate).attachment
+    return client.get(KEYS.operate, payload=payload, attachment=attachment, timeout=10.0)
+
+
 def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
     axis = FakeAxis()
     server, events = make(axis, tmp_path)
@@ -116,7 +122,7 @@ def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
         "time_unix_s": 1234.5, "who": "alice", "verb": "select", "arguments": {"model": "linear"},
         "instance": "i1-00", "ok": True, "seq": 41, "samples": 0,
     }  # fmt: skip
-    assert server.counters() == {"done": 6, "refused": 0, "unlogged": 0}
+    assert server.counters() == {"done": 6, "refused": 0, "unsigned": 0, "unlogged": 0}
 
 
 @pytest.mark.parametrize(
@@ -237,9 +243,36 @@ def test_over_the_wire(wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServe
     with pytest.raises(NoReplyError, match="dehyst/v1/demo/y"):
         operate(client, Keys("demo", "y"), "freeze", "alice", timeout_s=0.5)
     for payload in (b"", b"junk", b"x" * 2**20, None):
-        (reply,) = list(client.get(KEYS.operate, payload=payload, timeout=5.0))
+        (reply,) = list(request(client, payload))
         assert json.loads(reply.err.payload.to_bytes())["error"] == "InputError"
-    assert server.counters() == {"done": 1, "refused": 6, "unlogged": 0}
+    assert server.counters() == {"done": 1, "refused": 6, "unsigned": 0, "unlogged": 0}
+
+
+def test_only_who_has_the_key_commands(wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer]) -> None:
+    axis, client, server = wire_axis
+    payload = ask("freeze", "mallory")
+    theirs = Authenticator(b"a stranger's own one")
+    signed = own_authenticator().question(payload=payload, key=KEYS.operate).attachment
+    for attachment, got in (
+        (None, "none"),
+        (bytes(32), "wrong"),
+        (own_authenticator().question(payload=payload).attachment, "wrong"),  # a stamp alone, as for a status
+        (own_authenticator().question(payload=payload, key=KEYS.status).attachment, "wrong"),
+        (own_authenticator().question(payload=ask("thaw"), key=KEYS.operate).attachment, "wrong"),
+        (theirs.question(payload=payload, key=KEYS.operate).attachment, "wrong"),
+        (signed, ""),
+        (signed, "came before"),
+    ):
+        (reply,) = list(client.get(KEYS.operate, payload=payload, attachment=attachment, timeout=5.0))
+        if got:
+            error = json.loads(reply.err.payload.to_bytes())
+            assert (error["error"], error["field"]) == ("InputError", "authenticator")
+            assert got in error["got"]
+            assert "--key" in error["message"]
+    assert axis.done == [("freeze", "mallory")]
+    assert server.counters() == {"done": 1, "refused": 0, "unsigned": 7, "unlogged": 0}
+    with pytest.raises(RefusedError, match="authenticator: got a wrong one"):
+        operate(client, KEYS, "freeze", "mallory", authenticator=theirs)
 
 
 def test_who_only_says_that_a_command_is_done_is_not_believed(
@@ -265,7 +298,7 @@ def test_more_than_can_wait_is_refused_at_once(
     axis, client, server = wire_axis
     operate(client, KEYS, "thaw", "warm")
     axis.hold.clear()
-    waiting = [client.get(KEYS.operate, payload=ask("freeze", f"a{i}"), timeout=10.0) for i in range(40)]
+    waiting = [request(client, ask("freeze", f"a{i}")) for i in range(40)]
     time.sleep(0.2)
     axis.hold.set()
     replies = [reply for handler in waiting for reply in handler]
@@ -290,7 +323,7 @@ def test_a_flood_of_refused_requests_is_journaled_as_a_number(
     axis, client, server = wire_axis
     operate(client, KEYS, "thaw", "warm")
     axis.hold.clear()
-    waiting = [client.get(KEYS.operate, payload=ask("freeze", f"a{i}"), timeout=10.0) for i in range(200)]
+    waiting = [request(client, ask("freeze", f"a{i}")) for i in range(200)]
     eventually(lambda: server.counters()["refused"] >= 200 - 33)
     axis.hold.set()
     refused = sum(reply.err is not None for handler in waiting for reply in handler)

@@ -23,9 +23,9 @@ from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import CommandHeldError
 from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client
+from service.runtime.session import SURELY, open_client, open_service, wait_followed
 from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
-from service.security.lease import CommandLease, Holder, read_token, tag_of
+from service.security.lease import CommandGate, CommandLease, Holder, read_token, tag_of
 from service.stage_node.node import status_key
 from tests.service.living import eventually
 
@@ -243,6 +243,32 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
         assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), 4)
         lease.undeclare()
         del tokens
+
+
+def test_what_an_owner_said_before_it_lost_the_lease_is_not_repeated(free_port: int) -> None:
+    endpoint, key = f"tcp/127.0.0.1:{free_port}", os.urandom(16)
+    got: list[bytes] = []
+    sent: list[tuple[bytes, Any]] = []
+    with open_service([endpoint]) as stage, open_client(endpoint) as session, open_client(endpoint) as stranger:
+        gate = CommandGate(stage, KEYS, Authenticator(key), got.append)
+        stranger.declare_subscriber(KEYS.command, lambda s: sent.append((s.payload.to_bytes(), s.attachment)))
+        first, second = (CommandLease(session, KEYS, Authenticator(key)) for _ in range(2))
+        assert wait_followed(first.publisher, 5.0)
+        first.put(b"first")
+        eventually(lambda: sent and got == [b"first"])
+        second.take(force=True)
+        second.put(b"second")
+        eventually(lambda: got == [b"first", b"second"])
+        with pytest.raises(CommandHeldError):
+            first.put(b"first")
+        second.undeclare()
+        first.take(wait_s=5.0)
+        eventually(lambda: gate.owner is not None)
+        stranger.put(KEYS.command, sent[0][0], attachment=sent[0][1], congestion_control=SURELY)
+        eventually(lambda: gate.foreign == 1)
+        assert got == [b"first", b"second"]
+        first.undeclare()
+        gate.undeclare()
 
 
 def test_without_an_owner_commands_are_applied_as_they_come(stage: tuple[Stage, str]) -> None:

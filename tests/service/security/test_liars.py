@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +21,14 @@ import zenoh
 
 from service.client.client import Client
 from service.config.settings import read_config
+from service.operating.remote import operate
 from service.protocol.delta import FollowedState, encode_delta
 from service.protocol.errors import NoReplyError
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model, model_parts
 from service.protocol.query import Answer, encode_query, encode_reply
 from service.protocol.samples import encode_samples
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.security.authenticator import EVERYBODY, own_authenticator
 from service.server.process import Service
 from tests.service.conftest import make_models, unused_port, write_config
@@ -106,12 +108,14 @@ def test_a_follower_takes_no_model_of_a_liar(endpoint: str, liar: zenoh.Session,
             memory = state.message().memory
             whole = encode_delta(state.whole()) if deltas else encode_model(LEARNING, forged, 10**6, memory)
             for _ in range(100):
-                liar.put(KEYS.model_delta if deltas else KEYS.model, whole, attachment=bytes(32))
+                liar.put(
+                    KEYS.model_delta if deltas else KEYS.model, whole, attachment=bytes(32), congestion_control=SURELY
+                )
                 # Its own slow states move the voltage by less.
                 assert follower.point(40.0) == pytest.approx(honest_V, abs=0.01)
                 time.sleep(1e-3)
         assert follower.point(80.0) - follower.point(40.0) <= 2000.0 * 1e-3 + 1e-9
-        assert follower.refused == 200
+        eventually(lambda: follower.refused == 200)
         assert follower.received <= 2  # the one it fetched, and the first that the service publishes
 
 
@@ -122,7 +126,7 @@ def test_samples_of_a_liar_are_not_learnt_where_the_stage_signs(endpoint: str, l
             y_um = 45.0 + 30.0 * np.sin(2.0 * math.pi * 3e-3 * k)
             u_V = (y_um - 1.0) / 11.0
             if seq >= 5:  # the first ones tell the service that this stage signs
-                liar.put(KEYS.sample, encode_samples(k, k * 1e-3, u_V, 1.03 * y_um))
+                liar.put(KEYS.sample, encode_samples(k, k * 1e-3, u_V, 1.03 * y_um), congestion_control=SURELY)
                 time.sleep(2e-3)
             client.samples(k, k * 1e-3, u_V, y_um)
             time.sleep(3e-3)
@@ -131,7 +135,41 @@ def test_samples_of_a_liar_are_not_learnt_where_the_stage_signs(endpoint: str, l
         assert not gates.get("duplicate")
         assert not gates.get("out_of_order")
         assert status["samples"]["received"] == 1000
-        assert status["peers"]["samples_refused"] == 199
+        eventually(lambda: client.status()["peers"]["samples_refused"] == 199)
+
+
+def test_a_liar_commands_nothing(endpoint: str, liar: zenoh.Session) -> None:
+    """Neither by a request of its own, nor by one of an operator that it recorded and repeats."""
+    heard: list[tuple[bytes, bytes]] = []
+    events: list[dict[str, Any]] = []
+
+    def listen(query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            assert query.attachment is not None
+            heard.append((query.payload.to_bytes(), query.attachment.to_bytes()))
+
+    with Client.connect(endpoint, wait_s=20.0) as client, open_client(endpoint, 20.0) as operator, ExitStack() as stack:
+        stack.callback(liar.declare_queryable(KEYS.operate, listen).undeclare)
+        subscriber = operator.declare_subscriber(KEYS.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+        stack.callback(subscriber.undeclare)
+        time.sleep(0.2)
+        for verb in ("freeze", "thaw"):
+            assert operate(operator, KEYS, verb, "alice")["ok"]
+        freeze = heard[0]
+        for payload, attachment in (freeze, (freeze[0], heard[1][1]), (freeze[0], bytes(32))):
+            errors = [reply.err for reply in liar.get(KEYS.operate, payload=payload, attachment=attachment)]
+            assert any(error is not None and b"authenticator" in error.payload.to_bytes() for error in errors)
+        status = client.status()
+        assert not status["frozen"]
+        assert (status["operations"]["done"], status["operations"]["unsigned"]) == (2, 3)
+
+        def refused() -> list[str]:
+            return [event["detail"] for event in events if event["event"] == "operation_refused"]
+
+        eventually(refused)
+        assert len(refused()) == 1
+        assert "authenticator" in refused()[0]
 
 
 def test_what_a_liar_recorded_answers_no_other_query(endpoint: str, liar: zenoh.Session) -> None:
@@ -185,12 +223,12 @@ def test_what_a_liar_recorded_of_a_model_is_not_taken_again(endpoint: str, liar:
         subscriber.undeclare()
         received, seq = follower.received, follower.snapshot_seq
         for payload, attached in kept:
-            liar.put(KEYS.model, payload, attachment=attached)
+            liar.put(KEYS.model, payload, attachment=attached, congestion_control=SURELY)
         time.sleep(0.2)
         assert (follower.received, follower.snapshot_seq, follower.refused) == (received, seq, 0)
         # One that another sender signed once, before the present service began.
         earlier = own_authenticator().published(KEYS.model, kept[0][0])
-        liar.put(KEYS.model, kept[0][0], attachment=earlier)
+        liar.put(KEYS.model, kept[0][0], attachment=earlier, congestion_control=SURELY)
         time.sleep(0.3)
         assert follower.snapshot_seq == seq
 
@@ -208,7 +246,7 @@ def test_samples_that_a_liar_repeats_are_not_learnt_twice(endpoint: str, liar: z
         eventually(lambda: len(kept) == 100)
         subscriber.undeclare()
         for payload, attached in kept:
-            liar.put(KEYS.sample, payload, attachment=attached)
+            liar.put(KEYS.sample, payload, attachment=attached, congestion_control=SURELY)
         status = eventually(lambda: (s := client.status()) and s["peers"]["samples_refused"] == 100 and s)
         assert status["samples"]["received"] == 500
 

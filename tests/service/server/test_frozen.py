@@ -9,10 +9,10 @@ import pytest
 
 from adaptive.types import FloatArray
 from benchmarks.forged_states import DT_S, make_axis, recording
+from service.protocol.model import fingerprint
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 LEARNT, STEP = 1500, 20

@@ -21,12 +21,11 @@ from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sample_queue import SampleQueue
 from service.operating.verbs import Request, Verbs
-from service.protocol.model import digests
+from service.protocol.model import digests, fingerprint
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
-from service.server.learner_supervisor import fingerprint
 from service.storage import checkpoint
 from service.storage import model_file as modelfile
 from service.storage.checkpoint import (
