@@ -19,6 +19,7 @@ from adaptive.errors import DehystError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import (
     FROZEN,
+    GAP,
     LEARNT,
     NOT_FINITE,
     OUT_OF_RANGE,
@@ -173,7 +174,7 @@ class ModelWatch:
             n["still"], n["y"], n["u_low"], n["u_high"] = 0, y_um, u_V, u_V
         if verdict in _NOT_REFUSED or self.trouble not in ("", NOTHING_LEARNT):
             n["silent"], n["silent_low"], n["silent_high"] = 0, math.inf, -math.inf
-        else:
+        elif verdict != GAP:  # Missing samples have a trouble of their own.
             n["silent"] += 1
             n["silent_low"], n["silent_high"] = min(n["silent_low"], u_V), max(n["silent_high"], u_V)
             self._gate = verdict
@@ -326,7 +327,7 @@ def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
 # --- Stored states of a learner.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
-STATE_SCHEMA: Final = 5
+STATE_SCHEMA: Final = 6
 #: Settings in a learner's state.
 _SETTINGS: Final = re.compile(r"(^|\.)config\.")
 

@@ -14,7 +14,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online.gates import DUPLICATE, LEARNT, OUT_OF_ORDER, UNTRUSTED
+from adaptive.online.gates import DUPLICATE, GAP, LEARNT, OUT_OF_ORDER, UNTRUSTED
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answers.guard import Limits
@@ -108,19 +108,25 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     assert bench.u_V == pytest.approx(before, abs=0.2)
 
 
-@pytest.mark.parametrize(("swing", "learns"), [(0.5, False), (0.5, True), (0.005, False)])
-def test_half_a_second_of_motion_without_an_accepted_sample_is_a_trouble(swing: float, learns: bool) -> None:
-    """And neither is rest, nor a motion of which a sample is learnt now and then."""
+@pytest.mark.parametrize(
+    ("swing", "learns", "verdict", "at_s"),
+    [(0.5, False, UNTRUSTED, 0.52), (0.5, True, UNTRUSTED, None), (0.005, False, UNTRUSTED, None),
+     (0.5, False, GAP, None)],
+)  # fmt: skip
+def test_half_a_second_of_motion_without_an_accepted_sample_is_a_trouble(
+    swing: float, learns: bool, verdict: str, at_s: float | None
+) -> None:
+    """And neither is rest, nor a motion of which a sample is learnt now and then, nor the time after missing ones."""
     watch = ModelWatch(ModelWatchConfig(), DT_S, LIMITS)
     model = make_models()[NAME]
     found: list[float] = []
     for k in range(1000):
         u_V = 5.0 + 10.0 * swing * math.sin(2.0 * math.pi * 3.0 * k * DT_S)
-        watch.take(u_V, 50.0 + u_V, LEARNT if learns and k % 400 == 0 else UNTRUSTED)
+        watch.take(u_V, 50.0 + u_V, LEARNT if learns and k % 400 == 0 else verdict)
         if (k + 1) % 20 == 0:
             watch.judge(model, model)
             found += [(k + 1) * DT_S] * (watch.trouble == NOTHING_LEARNT)
-    assert (found[0] if found else None) == (pytest.approx(0.52) if swing == 0.5 and not learns else None)
+    assert (found[0] if found else None) == pytest.approx(at_s)
 
 
 @pytest.mark.parametrize("lie", [frozen, poisoned, lambda k, y: np.minimum(y, 50.0), lambda k, y: y * math.nan])
