@@ -97,12 +97,13 @@ def in_rests(readings: Readings) -> Sight:
 
 
 def in_cycles(readings: Readings) -> Sight:
-    """The mean of equal cycles goes with time. Where it is not clear that it is no creep, nothing is decided."""
+    """The mean of equal cycles changes, and not clearly as creep. Where creep may do the same, both are one set."""
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    seen = True if found.goes_on else None if found.moved else False
-    return Sight(seen, found.mean_words, found.also if seen else ())
+    if found.goes_on:
+        return Sight(True, found.mean_words, found.also)
+    return Sight(None if found.creeps else found.moved, found.mean_words, ("creep",) if found.moved else ())
 
 
 THERMAL_DRIFT = Kind(

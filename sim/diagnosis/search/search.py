@@ -33,6 +33,9 @@ from sim.readings.noise import has_spectral_line
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
 
+#: Least squared error that a line must remove, in that of the noise: half the square of a twentieth of its deviation.
+_LINE = 0.5 * 0.05**2
+
 
 @dataclass(frozen=True)
 class Thresholds:
@@ -235,6 +238,8 @@ class Search:
 
     def __post_init__(self) -> None:
         self.causes = self.causes or self.catalogue.forms
+        if self.readings is not None:
+            self.causes = tuple(cause.shown(self.readings) for cause in self.causes)
 
     def seen(self, cause: CauseModel) -> bool:
         """Whether a direct test sees this cause that answers to it alone, or gives the number that the fit has."""
@@ -386,8 +391,10 @@ class Search:
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
         if best.cause.line_hz(q) is not None:
-            return gain > 30.0 * self.sigma_um**2 and self.is_line(best.cause, q, base)
-        if len(parameters) == 1 and (q[0] <= parameters[0].low or q[0] >= parameters[0].high):
+            # A line of less than a twentieth of the noise is none that matters.
+            return gain > _LINE * float(self.mask.sum()) * self.sigma_um**2 and self.is_line(best.cause, q, base)
+        if any(not s.linear and not s.low < value < s.high for s, value in zip(parameters, q, strict=True)):
+            # A number at its bound is none that was found.
             return False
         if not self.plausible(best):
             return False
