@@ -231,10 +231,11 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     height = np.array(heights)
     relative = height / height.mean() - 1.0
     change, error = _slope(t, relative)
-    # What of the mean goes with the height is a change of the gain, about some displacement.
+    # What of the mean goes with the height is a change of the gain, about some displacement that the stage reaches.
     means_um = np.array(means)
     if abs(change) > _SIGMAS * error:
-        means_um -= relative * float(relative @ means_um) / float(relative @ relative)
+        level_um = float(relative @ means_um) / float(relative @ relative)
+        means_um -= relative * float(np.clip(level_um, -data.range_um, data.range_um))
     shift, shift_error = _slope(t, means_um)
     span = float(t[-1] - t[0])
     gained = abs(change * span) > 3e-4 and abs(change) > _SIGMAS * error

@@ -28,7 +28,7 @@ from sim.fitting.calibration import (
     with_new_columns,
 )
 from sim.fitting.parallel import side_by_side
-from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
+from sim.fitting.stage_model import INITIAL_STATE, CauseModel, ModelFit, StageModel
 from sim.readings.noise import has_spectral_line
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
@@ -393,7 +393,9 @@ class Search:
         if best.cause.line_hz(q) is not None:
             # A line of less than a twentieth of the noise is none that matters.
             return gain > _LINE * float(self.mask.sum()) * self.sigma_um**2 and self.is_line(best.cause, q, base)
-        if any(not s.linear and not s.low < value < s.high for s, value in zip(parameters, q, strict=True)):
+        own = [(s, v) for s, v in zip(parameters, q, strict=True) if not s.linear and s.name not in INITIAL_STATE]
+        at_bound = [s.name for s, v in own if not s.low < v < s.high and v != s.neutral]
+        if at_bound:
             # A number at its bound is none that was found.
             return False
         if not self.plausible(best):

@@ -70,6 +70,12 @@ def test_a_hum_of_two_percent_of_the_range_is_within_its_bounds() -> None:
     assert MainsHum().parameters(data)[1].high > 0.02 * data.range_um
 
 
+def test_readings_that_end_at_a_limit_are_seen_and_those_on_a_coarse_grid_are_not() -> None:
+    assert sights("clipped_reading")[0]["saturation"].seen is True
+    assert sights("quantisation")[0]["saturation"].seen is not True
+    assert sights("")[0]["saturation"].seen is not True
+
+
 def test_a_ring_down_at_the_start_is_left_out_and_an_equal_one_later_is_not() -> None:
     rng = np.random.default_rng(1)
     residual, whole = 0.05 * rng.standard_normal(8000), np.ones(8000, dtype=np.bool_)
