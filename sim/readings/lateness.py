@@ -110,6 +110,8 @@ class _Described:
 def lateness(readings: Readings) -> Lateness:
     """Slips or a wrong clock in the readings, by their description with plays of the voltage."""
     data = readings.data
+    if data.swing_V == 0.0:
+        return Lateness()
     by, block, n = _Description(_columns(readings), readings.mask), _block(data), data.n
     ramp = np.arange(n) / n
     first = now = by.of(data.y_um, np.zeros(n))
