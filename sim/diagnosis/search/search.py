@@ -395,8 +395,8 @@ class Search:
             return gain > _LINE * float(self.mask.sum()) * self.sigma_um**2 and self.is_line(best.cause, q, base)
         own = [(s, v) for s, v in zip(parameters, q, strict=True) if not s.linear and s.name not in INITIAL_STATE]
         at_bound = [s.name for s, v in own if not s.low < v < s.high and v != s.neutral]
-        if at_bound:
-            # A number at its bound is none that was found.
+        # A number at its bound is none that was found. Of many modes one may be.
+        if at_bound and 2 * len(at_bound) >= len(own):
             return False
         if not self.plausible(best):
             return False

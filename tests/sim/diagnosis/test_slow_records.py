@@ -56,7 +56,8 @@ def test_what_does_not_act_on_time_is_no_timing(cause: str) -> None:
 def test_a_drift_of_any_form_is_seen_in_equal_cycles(cause: str) -> None:
     found = sights(cause)[0]
     assert found["thermal_drift"].seen is True, found["thermal_drift"].words
-    assert found["creep"].seen is not True, found["creep"].words
+    # One that settles may be creep: then both are one set.
+    assert found["creep"].seen is not True or "creep" in found["thermal_drift"].also, found["creep"].words
 
 
 def test_a_gain_that_drifts_about_the_middle_moves_no_mean() -> None:
