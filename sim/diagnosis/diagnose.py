@@ -83,6 +83,21 @@ def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_we
     return out
 
 
+def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
+    """The mask without the time in which a linear stage's mode rings down to 0.1 %, at most 5 % of the recording.
+
+    It only applies where the recording does not begin at rest: then the initial state of the mode is unknown.
+    """
+    if fit.model.nominal.name != "linear" or data.begins_at_rest:
+        return mask
+    slowest = min(
+        (2.0 * np.pi * f * (z if z < 1.0 else 0.5 / z) for f, z in fit.model.dynamics(fit.p).modes_hz), default=np.inf
+    )
+    out = mask.copy()
+    out[: min(int(np.log(1e3) / slowest / data.dt_s), data.n // 20)] = False
+    return out
+
+
 def without_start(mask: BoolArray, residual_um: FloatArray, dt_s: float) -> BoolArray:
     """The mask without the blocks of 10 ms at the start whose error exceeds any behind the first tenth of the record.
 
@@ -144,7 +159,7 @@ def diagnose(
     data = with_nominal_kind(options.nominal, data)
     progress("calibrating the nominal stage", 0.02)
     nominal = calibrate_nominal(options.nominal, data, mask)
-    nominal, mask, started = _behind_start(options, nominal, mask)
+    nominal, mask, started = _behind_start(options, nominal, settled(mask, nominal, data))
     grid = converter_grid(data.y_um[mask])
     # A mode that the nominal stage has still rings in the rests of the readings, and less in what it leaves of them.
     floor = floor_beside(grid, noise_floor(data), noise_floor(data, nominal.residual_um))
@@ -190,7 +205,7 @@ def diagnose(
         held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
         ceiling_um = black_box_error(nominal, extended, mask, search.parts)
     else:
-        shown_mask = usable(test.data, test.mask, options.nominal)
+        shown_mask = settled(usable(test.data, test.mask, options.nominal), nominal, test.data)
         there = fit_on_other_recording(nominal, test.data, shown_mask)
         shown_mask = without_start(shown_mask, there.residual_um, test.data.dt_s)
         on_test = (

@@ -28,7 +28,7 @@ from sim.fitting.calibration import (
     with_new_columns,
 )
 from sim.fitting.parallel import side_by_side
-from sim.fitting.stage_model import INITIAL_STATE, CauseModel, ModelFit, StageModel
+from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 from sim.readings.noise import has_spectral_line
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
@@ -393,10 +393,9 @@ class Search:
         if best.cause.line_hz(q) is not None:
             # A line of less than a twentieth of the noise is none that matters.
             return gain > _LINE * float(self.mask.sum()) * self.sigma_um**2 and self.is_line(best.cause, q, base)
-        own = [(s, v) for s, v in zip(parameters, q, strict=True) if not s.linear and s.name not in INITIAL_STATE]
-        at_bound = [s.name for s, v in own if not s.low < v < s.high and v != s.neutral]
-        # A number at its bound is none that was found. Of many modes one may be.
-        if at_bound and 2 * len(at_bound) >= len(own):
+        ends = [v != s.neutral and not s.low < v < s.high for s, v in zip(parameters, q, strict=True) if not s.linear]
+        if len(parameters) <= 2 and any(ends):
+            # A number at its bound is none that was found. Of the many of a free form some may be.
             return False
         if not self.plausible(best):
             return False
@@ -542,7 +541,9 @@ class Search:
         """The guesses beside the causes of ``fit``, without those that the review dropped."""
         names = {cause.name for cause in fit.model.causes}
         dropped = {cause.name for cause in self.unsteady} | self.uncertain
-        return self.looks(fit, self.catalogue.same_set(names) | dropped)
+        # What a direct test cannot tell from a cause that is there, and is seen by the same, is that cause once more.
+        either = {other for name in names for other in self.shown_as_well(name) if name in self.shown_as_well(other)}
+        return self.looks(fit, self.catalogue.same_set(names) | dropped | either)
 
     def _last(self, candidate: CauseCandidate, index: int) -> tuple[CauseCandidate, ModelFit]:
         """An earlier cause of a candidate's model as the candidate, and the model without it."""
