@@ -124,7 +124,8 @@ THERMAL_DRIFT = Kind(
     tells_apart="it does not follow the steps, creep does",
     source="up to 1 µm per kelvin and 50 mm of aluminium (expansion 23e-6 per kelvin)",
     cause=Cause(
-        sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time",
+        sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time, settles "
+        "exponentially, or wanders",
         forms=(ThermalDrift(), ThermalDrift(variant="temperature", of_one_recording=False)),
         tests=(in_rests, in_cycles),
         in_library=in_library,
