@@ -80,7 +80,7 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
         _file(d, exported) + (" `diagnosis.rrd` opens in the Rerun viewer." if viewer else ""),
         "",
     ]
-    findings = (*source.findings, *(defect.words for defect in d.defects))
+    findings = (*source.findings, *d.notes, *(defect.words for defect in d.defects))
     if findings:
         lines += ["## The recording itself", "", *(f"- {text}" for text in findings), ""]
     return "\n".join(lines)
@@ -111,7 +111,7 @@ def _summary(d: Diagnosis, source: Source) -> list[str]:
         "unexplained": "Something is in this recording that no cause of the catalogue explains.",
     }[d.verdict]
     if d.verdict == "adequate" and d.nominal_heldout_um > AT_THE_FLOOR * d.noise_floor_um:
-        verdict = f"What {nominal} leaves of this recording, a black box cannot predict either: it is noise."
+        verdict = f"What {nominal} leaves of this recording has the spectrum of noise."
     if d.heldout_source == TEST and d.partial:
         lost = ", ".join(spaced(n) for n in d.partial)
         verdict = f"What was found in the recording ({lost}) does not carry over to the test recording. {verdict}"

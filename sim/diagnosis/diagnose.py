@@ -8,7 +8,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.lapack import one_thread
-from adaptive.types import BoolArray
+from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.nominal import (
@@ -31,6 +31,7 @@ from sim.readings.noise import (
     ConverterGrid,
     NoiseFloor,
     converter_grid,
+    is_noise,
     noise_floor,
     recording_defects,
     repeated_readings,
@@ -97,6 +98,32 @@ def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
     return out
 
 
+def without_start(mask: BoolArray, residual_um: FloatArray, dt_s: float) -> BoolArray:
+    """The mask without the blocks of 10 ms at the start whose error exceeds any behind the first tenth of the record.
+
+    What moved before the record (a mode that rings down, a lag that settles) ends, and no cause may be named for it.
+    """
+    block, tenth = max(4, round(0.01 / dt_s)), residual_um.size // 10
+    error = np.where(mask, residual_um, 0.0)[: residual_um.size // block * block].reshape(-1, block)
+    rms = np.sqrt(np.mean(np.square(error), axis=1))
+    usual = _BEYOND * float(np.max(rms[tenth // block :], initial=0.0))
+    large = np.flatnonzero(rms[: tenth // block] > usual)
+    out = mask.copy()
+    out[: (int(large[-1]) + 1) * block if large.size else 0] = False
+    return out
+
+
+def _behind_start(options: Options, fit: ModelFit, mask: BoolArray) -> tuple[ModelFit, BoolArray, tuple[str, ...]]:
+    """The nominal stage, calibrated without a start that still settles; the mask without it, and what is said of it."""
+    data = fit.model.data
+    behind = without_start(mask, fit.residual_um, data.dt_s)
+    if np.array_equal(behind, mask):
+        return fit, mask, ()
+    begin_s = float(np.flatnonzero(behind)[0]) * data.dt_s
+    note = f"the first {begin_s:.3g} s are left out: the stage still settles from what was before the record"
+    return calibrate_nominal(options.nominal, data, behind), behind, (note,)
+
+
 def diagnose_prepared(
     prepared: Prepared,
     *,
@@ -132,7 +159,7 @@ def diagnose(
     data = with_nominal_kind(options.nominal, data)
     progress("calibrating the nominal stage", 0.02)
     nominal = calibrate_nominal(options.nominal, data, mask)
-    mask = settled(mask, nominal, data)
+    nominal, mask, started = _behind_start(options, nominal, settled(mask, nominal, data))
     grid = converter_grid(data.y_um[mask])
     # A mode that the nominal stage has still rings in the rests of the readings, and less in what it leaves of them.
     floor = floor_beside(grid, noise_floor(data), noise_floor(data, nominal.residual_um))
@@ -179,6 +206,8 @@ def diagnose(
         ceiling_um = black_box_error(nominal, extended, mask, search.parts)
     else:
         shown_mask = settled(usable(test.data, test.mask, options.nominal), nominal, test.data)
+        there = fit_on_other_recording(nominal, test.data, shown_mask)
+        shown_mask = without_start(shown_mask, there.residual_um, test.data.dt_s)
         on_test = (
             fit_on_other_recording(nominal, test.data, shown_mask),
             fit_on_other_recording(extended, test.data, shown_mask),
@@ -189,7 +218,8 @@ def diagnose(
         taught_um = min(black_box_on_other(nominal, on_test[0], mask, shown_mask, search.parts), *held_um)
         shown_floor_um = min(noise_floor(test.data).sigma_um, floor.sigma_um)
     explained = explained_share(*held_um, ceiling_um, shown_floor_um)
-    verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)
+    shown = (on_test or (nominal, extended))[0]
+    verdict = verdict_of(causes, *held_um, is_noise(shown.residual_um, shown_mask), floor.sigma_um, explained)
     partial: tuple[str, ...] = ()
     if verdict == "unexplained" and causes:
         partial, causes = tuple(c.name for c in causes if c.index >= 0), tuple(c for c in causes if c.index < 0)
@@ -197,9 +227,7 @@ def diagnose(
         verdict = "partly" if causes else verdict
     missing = not_excited(search, floor)
     progress("simulating the next experiment", 0.95)
-    is_named = verdict in ("effects", "partly")
-    untested = tuple(c.name for c in causes if is_named and c.witness is not None and c.witness.seen is None)
-    open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if is_named]
+    next_ = _next(search, extended, causes, found, verdict, missing)
     return Diagnosis(
         verdict=verdict,
         nominal_rmse_um=float(np.sqrt(nominal.sse_um2 / n)),
@@ -210,10 +238,10 @@ def diagnose(
         floor_source=floor.source,
         causes=causes,
         not_excited=missing,
-        next_experiment=next_experiment(open_, missing, untested, extended, floor.sigma_um, options.catalogue),
+        next_experiment=next_,
         nominal=nominal,
         extended=extended,
-        notes=notes,
+        notes=(*notes, *started),
         partial=partial,
         heldout_source=FOLDS if test is None else TEST,
         ceiling_um=ceiling_um,
@@ -225,6 +253,23 @@ def diagnose(
         on_test=on_test,
         catalogue=options.catalogue,
     )
+
+
+def _next(
+    search: Search,
+    extended: ModelFit,
+    causes: tuple[NamedCause, ...],
+    found: list[ReviewedCause],
+    verdict: str,
+    missing: tuple[str, ...],
+) -> str | None:
+    """The next experiment, for what this recording leaves open."""
+    named = verdict in ("effects", "partly")
+    rivals = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if named]
+    sets = [(c.name, *c.alternatives) for c in causes if c.alternatives]
+    untested = tuple(c.name for c in causes if named and c.witness is not None and c.witness.seen is None)
+    unexplained = verdict in ("partly", "unexplained")
+    return next_experiment(rivals, sets, missing, untested, unexplained, extended, search.sigma_um, search.catalogue)
 
 
 def floor_beside(grid: ConverterGrid, *floors: NoiseFloor) -> NoiseFloor:
@@ -284,6 +329,8 @@ def changing(search: Search) -> tuple[str, ...]:
     return tuple(out)
 
 
+#: The error of a start is this many times that of any later block.
+_BEYOND = 1.5
 #: Share of the explainable squared error from which named causes explain a recording, or a part of it.
 EXPLAINED, IN_PART = 0.8, 0.1
 #: Largest error, in noise floors, that may be noise: slow noise is smaller within a rest than over the record.
@@ -309,11 +356,12 @@ def verdict_of(
     causes: tuple[NamedCause, ...],
     nominal_um: float,
     extended_um: float,
-    ceiling_um: float,
+    noise: bool,
     floor_um: float,
     explained: float,
 ) -> str:
-    """The verdict: "adequate", "effects", "partly" or "unexplained". Lengths are held-out RMS errors."""
+    """The verdict: "adequate", "effects", "partly" or "unexplained". Lengths are held-out RMS errors; ``noise``: the
+    spectrum of what the nominal stage leaves is that of noise (`is_noise`)."""
     structured = extended_um**2 > 1.5 * floor_um**2
     if causes:
         if any(c.index < 0 for c in causes) and not structured:
@@ -324,9 +372,8 @@ def verdict_of(
             if explained >= IN_PART:
                 return "partly"
         return "unexplained"
-    # An error that a black box cannot predict is noise of some colour, unless it is far above the noise in the rests.
-    noise = nominal_um <= min(1.1 * ceiling_um, MOST_NOISE * floor_um)
-    return "unexplained" if structured and not noise else "adequate"
+    # Noise of some colour may be above the noise within a rest, but not far.
+    return "adequate" if not structured or (noise and nominal_um <= MOST_NOISE * floor_um) else "unexplained"
 
 
 def not_excited(search: Search, floor: NoiseFloor) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from sim.readings.readings import Readings
 
 #: Resolution of a voltage monitor relative to the swing.
 MONITOR_NOISE = 2e-4
+RATES = "triangles and sines at three rates over two decades and at two amplitudes"
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def experiments(data: FitData) -> list[Experiment]:
     shapes = [
         (f"steps to four levels, each held for {total / 5.0:.3g} s", levels[np.minimum((x * 5.0).astype(int), 4)]),
         ("full steps every 0.4 s", short[(np.arange(n) // every) % 7]),
-        ("triangles and sines at three rates over two decades and at two amplitudes", rates),
+        (RATES, rates),
         ("nested triangles, every loop inside the one before", nested),
         (f"a small chirp of 5 % of the range up to {top:.3g} Hz", 0.5 + 0.025 * sweep),
     ]
@@ -78,15 +79,18 @@ def _at(model: StageModel, p: FloatArray, experiment: Experiment) -> FloatArray:
 
 def next_experiment(
     rivals: list[Rival],
+    sets: list[tuple[str, ...]],
     missing: tuple[str, ...],
     untested: tuple[str, ...],
+    unexplained: bool,
     fit: ModelFit,
     sigma_um: float,
     catalogue: Catalogue,
 ) -> str | None:
     """What to record next, as a sentence with the simulated difference; None if nothing is open.
 
-    ``missing``: names of the causes that the recording does not excite; ``untested``: those of named causes whose
+    ``sets``: named causes with their alternatives; ``unexplained``: a part of the error has no name; ``missing``: names
+    of the causes that the recording does not excite; ``untested``: those of named causes whose
     direct test it does not excite.
     """
     data = fit.model.data
@@ -114,8 +118,14 @@ def next_experiment(
             f"{best}: simulated, {rival.name} and {rival.other} then differ by {size * 1e3:.3g} nm rms "
             f"({size / sigma_um:.2g} times the noise), against {here * 1e3:.2g} nm in this record"
         )
+    if unexplained:
+        return f"{RATES}, with rests between them: what is left then shows whether it goes with rate, height or time"
     shown = _excite([f for f in catalogue.forms if f.name in missing], fit, sigma_um)
-    return shown or (_test(untested, fit, sigma_um, catalogue) if untested else None)
+    shown = shown or (_test(untested, fit, sigma_um, catalogue) if untested else None)
+    if shown or not sets:
+        return shown
+    (name, other, *_), hint = sets[0], catalogue.kind(sets[0][0]).tells_apart
+    return f"no drive of this stage separates {name} from {other}, but: {hint}"
 
 
 def _apart(a: FloatArray, b: FloatArray) -> float:

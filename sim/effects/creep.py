@@ -146,9 +146,12 @@ def in_rests(readings: Readings) -> Sight:
 
 
 def in_cycles(readings: Readings) -> Sight:
-    """The mean of equal cycles goes with the logarithm of time. Where that is not clear, nothing is decided."""
+    """The mean of equal cycles goes with the logarithm of time. Where a drift may do the same, both are one set."""
     found = readings.once(cycles_over_time)
-    return Sight(None, found.missing) if found.missing else Sight(True if found.creeps else None, found.mean_words)
+    if found.missing:
+        return Sight(None, found.missing)
+    either = found.moved and not (found.creeps or found.goes_on)
+    return Sight(True if found.creeps or either else None, found.mean_words, ("thermal_drift",) if either else ())
 
 
 CREEP = Kind(

@@ -15,7 +15,7 @@ from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, 
 from sim.effects.counter_noise import normal
 from sim.effects.slow_change import SlowChange
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel
+from sim.fitting.stage_model import CauseModel, Guess
 from sim.readings.sight import Sight
 from sim.readings.slow_motion import cycles_over_time, rests_over_time
 
@@ -48,24 +48,37 @@ def derive_gain_drift(values: Mapping[str, float], context: Context) -> Sequence
 
 @dataclass(frozen=True)
 class GainDrift(SlowChange):
-    """A slow change of the gain."""
+    """A slow change of the gain about a displacement that stays: an actuator's zero, or the zero of a sensor, which has
+    any offset."""
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         if self.variant == "temperature":
             return (ModelParameter("gain_per_K", "1/K", 0.0, -0.05, 0.05, 1e-3, ActsOn.MOTION),)
-        return tuple(
-            ModelParameter(f"gain{j + 1}", "1", 0.0, -0.2, 0.2, 2e-3, ActsOn.MOTION, True)
-            for j in range(self.spans(data))
+        r = data.range_um
+        return (
+            ModelParameter("stays_um", "µm", 0.0, -3.0 * r, 3.0 * r, 0.1 * r, ActsOn.MOTION),
+            *(
+                ModelParameter(f"gain{j + 1}", "1", 0.0, -0.2, 0.2, 2e-3, ActsOn.MOTION, True)
+                for j in range(self.spans(data))
+            ),
         )
 
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        rows = super().guesses(data, residual_um)
+        return rows if self.variant == "temperature" else [trial[1:] for trial in rows]
+
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        found = super().refined(p[1:], left_floors, data)
+        return None if found is None else (found[0], [np.append(p[0], start) for start in found[1]])
+
     def agreement(self, p: FloatArray, readings: Readings) -> str:
-        fitted = self.agrees(readings.once(rests_over_time).gain, p, readings.data)
+        fitted = self.agrees(readings.once(rests_over_time).gain, p[1:], readings.data)
         return "" if fitted is None else f"the fit by {100.0 * fitted:.3g} %"
 
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if self.variant == "temperature":
             return x_um if data.warmth_K is None else x_um * (1.0 + p[0] * data.warmth_K)
-        return x_um * (1.0 + self.course(p, data))
+        return np.asarray(x_um + (x_um - p[0]) * self.course(p[1:], data))
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         if self.variant == "temperature":

@@ -59,13 +59,13 @@ class MainsHum(CauseModel):
         return [k for k in (1, 2, 3) if k * float(self.variant) < 0.48 / data.dt_s]
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        f, top = float(self.variant), 0.005 * data.range_um
+        f, top = float(self.variant), 0.05 * data.range_um
         own: list[ModelParameter] = [
             ModelParameter("frequency_hz", "Hz", f, f - 0.6, f + 0.6, 0.05 / data.duration_s, ActsOn.READING)
         ]
         for k in self.orders(data):
             own += [
-                ModelParameter(f"{w}{k}_um", "µm", 0.0, -top, top, 1e-3 * top, ActsOn.READING) for w in ("sin", "cos")
+                ModelParameter(f"{w}{k}_um", "µm", 0.0, -top, top, 1e-4 * top, ActsOn.READING) for w in ("sin", "cos")
             ]
         return tuple(own)
 

@@ -97,12 +97,13 @@ def in_rests(readings: Readings) -> Sight:
 
 
 def in_cycles(readings: Readings) -> Sight:
-    """The mean of equal cycles goes with time. Where it is not clear that it is no creep, nothing is decided."""
+    """The mean of equal cycles changes, and not clearly as creep. Where creep may do the same, both are one set."""
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    seen = True if found.goes_on else None if found.moved else False
-    return Sight(seen, found.mean_words, found.also if seen else ())
+    if found.goes_on:
+        return Sight(True, found.mean_words, found.also)
+    return Sight(None if found.creeps else found.moved, found.mean_words, ("creep",) if found.moved else ())
 
 
 THERMAL_DRIFT = Kind(
@@ -123,7 +124,8 @@ THERMAL_DRIFT = Kind(
     tells_apart="it does not follow the steps, creep does",
     source="up to 1 µm per kelvin and 50 mm of aluminium (expansion 23e-6 per kelvin)",
     cause=Cause(
-        sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time",
+        sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time, settles "
+        "exponentially, or wanders",
         forms=(ThermalDrift(), ThermalDrift(variant="temperature", of_one_recording=False)),
         tests=(in_rests, in_cycles),
         in_library=in_library,

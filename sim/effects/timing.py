@@ -22,7 +22,9 @@ from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, 
 from sim.effects.counter_noise import uniform
 from sim.fitting.calibration import calibrate, evaluate
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.lags import resample_by
 from sim.fitting.stage_model import CauseModel, Guess, ModelFit, StageModel, single_guesses
+from sim.readings.lateness import SlipList, lateness
 from sim.readings.sight import Sight
 
 if TYPE_CHECKING:
@@ -72,23 +74,6 @@ def derive_timing(values: Mapping[str, float], context: Context) -> Sequence[flo
 
 
 @compiled
-def resample_by(x: FloatArray, shifts: FloatArray) -> FloatArray:
-    """(n,) x at the instants k + shifts[k] by cubic (Catmull-Rom) interpolation, constant beyond the ends."""
-    n = x.shape[0]
-    out = np.empty(n)
-    for k in range(n):
-        whole = math.floor(shifts[k])
-        f = shifts[k] - whole
-        i = k + int(whole)
-        a = x[min(max(i - 1, 0), n - 1)]
-        b = x[min(max(i, 0), n - 1)]
-        c = x[min(max(i + 1, 0), n - 1)]
-        d = x[min(max(i + 2, 0), n - 1)]
-        out[k] = b + 0.5 * f * (c - a + f * (2.0 * a - 5.0 * b + 4.0 * c - d + f * (3.0 * (b - c) + d - a)))
-    return out
-
-
-@compiled
 def resample(x: FloatArray, stretch: float, shift: float) -> FloatArray:
     """(n,) x at the instants k (1 + stretch) + shift, see `resample_by`."""
     shifts = stretch * np.arange(x.shape[0], dtype=np.float64) + shift
@@ -111,7 +96,12 @@ class Clock(CauseModel):
         """A change of the lateness by three standard errors that is within a quarter of the fitted one."""
         change = readings.once(change_of_lateness)
         fits = abs(float(p[0]) + change.ppm) < 0.25 * abs(change.ppm)
-        return f"the fit by {-float(p[0]):.3g} ppm" if fits and abs(change.ppm) > 3.0 * change.sigma_ppm else ""
+        # In a description of all motion a loop's own lateness wanders: there only a clear trend counts.
+        clear = change.steady if change.count == 0 else abs(change.ppm) > 3.0 * change.sigma_ppm
+        return f"the fit by {-float(p[0]):.3g} ppm" if fits and clear else ""
+
+    def borne_out(self, readings: Readings) -> bool:
+        return not readings.once(change_of_lateness).slips
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         return (ModelParameter("clock_ppm", "ppm", 0.0, -2000.0, 2000.0, 5.0, ActsOn.READING),)
@@ -136,8 +126,6 @@ _FIRST = 100
 _SHORTEST = 64
 #: Rounds in which slips of size zero are dropped; each is a calibration.
 _ROUNDS_OF_DROPPING = 3
-#: Slips in order: first sample, and number of samples lost (negative: gained).
-SlipList = tuple[tuple[int, int], ...]
 IntArray = NDArray[np.int64]
 #: Least share of the squared error that a further slip must remove.
 _LEAST_GAIN = 0.002
@@ -319,8 +307,9 @@ class Slips(CauseModel):
     beside_its_kind: bool = True
     variant: str = "slips"
     of_one_recording: bool = True
-    #: The slips, found again in every residual.
+    #: The slips, found again in every residual unless the readings themselves date them.
     found: SlipList = ()
+    dated: bool = False
 
     def missing(self, data: FitData) -> str:
         return "" if self.found else "a lasting jump of the timing"
@@ -328,12 +317,25 @@ class Slips(CauseModel):
     def borne_out(self, readings: Readings) -> bool:
         return slips_are_borne_out(readings, self.found)
 
+    def shown(self, readings: Readings) -> Slips:
+        slips = readings.once(change_of_lateness).slips
+        return replace(self, found=slips, dated=True) if slips else self
+
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        """The fit loses as many samples at the dates that the readings give."""
+        slips = readings.once(change_of_lateness).slips
+        fits = len(slips) == p.size and all(abs(q - size) < 0.4 for q, (_, size) in zip(p, slips, strict=True))
+        return f"the fit loses {p.sum():.3g}" if slips and fits else ""
+
     def found_again(self, fit: ModelFit, mask: BoolArray) -> Slips:
-        if any(cause.name == self.name for cause in fit.model.causes):
+        if self.dated or any(cause.name == self.name for cause in fit.model.causes):
             return self
         return replace(self, found=find_slips(fit.model.data.y_um, fit.signals.reading_um, mask))
 
     def own_fit(self, bare: StageModel, base: ModelFit, mask: BoolArray) -> ModelFit:
+        if self.dated:
+            start = np.append(base.p, [float(size) for _, size in self.found])
+            return calibrate(bare.with_cause(self), start, mask, 8, 1e-3)
         return fit_slips(self, bare, base, mask)
 
     def fitted_again(self, fit: ModelFit, index: int, mask: BoolArray) -> ModelFit:
@@ -341,6 +343,8 @@ class Slips(CauseModel):
 
         An earlier model that lacked some causes may have dated slips wrongly or missed one.
         """
+        if self.dated:
+            return fit
         bare = fit.model.without_cause(index)
         where = fit.model.slice_of(index)
         # `fit_slips` appends the slips at the end of the causes.
@@ -463,13 +467,15 @@ _PASSES = 6
 class LatenessChange:
     """By how much the lateness of the readings changes over the record, in ``count`` windows of fast motion.
 
-    ``steady``: in both halves of the record alike.
+    ``count`` 0: by a description of all motion. ``steady``: in both halves of the record alike. ``slips``: lost samples
+    by their dates.
     """
 
     count: int
     ppm: float = 0.0
     sigma_ppm: float = 0.0
     steady: bool = False
+    slips: SlipList = ()
 
 
 def change_of_lateness(readings: Readings) -> LatenessChange:
@@ -482,7 +488,8 @@ def change_of_lateness(readings: Readings) -> LatenessChange:
     data = readings.data
     t, d, e = readings.lateness
     if t.size < 6:
-        return LatenessChange(t.size)
+        found = readings.once(lateness)
+        return LatenessChange(0, -found.change_ppm, found.error_ppm, bool(found.ppm), found.slips)
     to_ppm = 1e6 * data.dt_s
     off, slope, sigma = 0.0, *_trend(t, d, e)
     now = readings
@@ -509,12 +516,12 @@ def change_of_lateness(readings: Readings) -> LatenessChange:
 def seen(readings: Readings) -> Sight:
     """A clock error by the change of the lateness of the readings (`change_of_lateness`)."""
     change = readings.once(change_of_lateness)
-    if change.count < 6:
-        return Sight(None, "too few stretches of fast motion to date the readings")
-    words = (
-        f"the readings' lateness changes by {change.ppm:.3g} ± {1.96 * change.sigma_ppm:.2g} ppm over {change.count} "
-        "stretches of motion"
-    )
+    if change.slips:
+        dt_s = readings.data.dt_s
+        dates = ", ".join(f"{n:+d} from {at * dt_s:.4g} s on" for at, n in change.slips)
+        return Sight(True, f"the readings are early by whole samples: {dates}")
+    where = f"over {change.count} stretches of motion" if change.count else "by a description of all motion"
+    words = f"the readings' lateness changes by {change.ppm:.3g} ± {1.96 * change.sigma_ppm:.2g} ppm {where}"
     if change.steady and abs(change.ppm) > 5.0 * change.sigma_ppm and abs(change.ppm) > 12.0:
         return Sight(True, words)
     # Slips have dates of their own and are judged by whole samples; without a trend nothing is decided here.

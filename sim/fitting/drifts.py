@@ -25,7 +25,7 @@ class Drift(CauseModel):
         return "" if data.duration_s > 1.0 else "a record longer than a second"
 
     def spans(self, data: FitData) -> int:
-        return int(np.clip(data.duration_s // 10.0, 2, 6))
+        return int(np.clip(data.duration_s // 5.0, 2, 6))
 
 
 def spline(p: FloatArray, data: FitData) -> FloatArray:

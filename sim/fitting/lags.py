@@ -1,4 +1,4 @@
-"""First-order lags of a signal: operators that several forms, the black box and the direct tests use."""
+"""First-order lags and moved instants of a signal: what several forms, the black box and the direct tests use."""
 
 from __future__ import annotations
 
@@ -43,4 +43,21 @@ def slow_poles(x: FloatArray, rates: FloatArray) -> FloatArray:
         for k in range(n):
             out[j, k] = s
             s = keep * s + take * (x[k] - x[0])
+    return out
+
+
+@compiled
+def resample_by(x: FloatArray, shifts: FloatArray) -> FloatArray:
+    """(n,) x at the instants k + shifts[k] by cubic (Catmull-Rom) interpolation, constant beyond the ends."""
+    n = x.shape[0]
+    out = np.empty(n)
+    for k in range(n):
+        whole = math.floor(shifts[k])
+        f = shifts[k] - whole
+        i = k + int(whole)
+        a = x[min(max(i - 1, 0), n - 1)]
+        b = x[min(max(i, 0), n - 1)]
+        c = x[min(max(i + 1, 0), n - 1)]
+        d = x[min(max(i + 2, 0), n - 1)]
+        out[k] = b + 0.5 * f * (c - a + f * (2.0 * a - 5.0 * b + 4.0 * c - d + f * (3.0 * (b - c) + d - a)))
     return out

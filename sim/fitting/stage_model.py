@@ -144,6 +144,10 @@ class CauseModel:
         """
         return None
 
+    def shown(self, readings: Readings) -> CauseModel:
+        """The form with what the readings themselves show of it."""
+        return self
+
     def found_again(self, fit: ModelFit, mask: BoolArray) -> CauseModel:
         """The form with what is to be found anew in each residual."""
         return self

@@ -44,6 +44,10 @@ def repeated_period(u_V: FloatArray) -> int:
 _RINGS = 2.0
 
 
+#: How often noise may look like a line.
+_NO_LINE = 1e-3
+
+
 def noise_floor(data: FitData, y_um: FloatArray | None = None) -> NoiseFloor:
     """The noise floor from repeated periods, else from windows at rest (spread about a line), else from differences.
 
@@ -199,6 +203,23 @@ def has_spectral_line(
         return False
     beside = [_amplitude(r, t, f_hz + d)[0] for d in (-4.3, -3.1, -2.2, 2.2, 3.1, 4.3)]
     return size > ratio * float(np.median(beside))
+
+
+def is_noise(residual_um: FloatArray, mask: BoolArray) -> bool:
+    """Whether the spectrum of a residual (n,) on the samples of ``mask`` (n,) is that of noise of some colour.
+
+    Over its level (a curve over the logarithm of frequency, then a running median of 101 frequencies) the power of
+    noise is exponentially distributed. An error of a model follows the drive and has lines. The slowest ten frequencies
+    do not count.
+    """
+    r = np.where(mask, residual_um, 0.0)
+    power = np.square(np.abs(np.fft.rfft((r - r.mean()) * np.hanning(r.size))))[10:-1]
+    power = np.maximum(power, 1e-300)
+    bend = np.polynomial.Polynomial.fit(np.log(np.arange(10.0, 10.0 + power.size)), np.log(power), 3)
+    power = power / np.exp(bend(np.log(np.arange(10.0, 10.0 + power.size))))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(power, 50, mode="reflect"), 101)
+    level = np.median(around, axis=1) / math.log(2.0)
+    return bool(np.max(power / level) < math.log(power.size / _NO_LINE))
 
 
 # --- Defects of the recording itself: repeated readings and lost samples. They are listed and never named as causes.

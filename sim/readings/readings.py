@@ -24,7 +24,7 @@ T = TypeVar("T")
 #: A drive counts as standing after this time without a change of voltage, s: lags and modes have settled.
 SETTLE_S = 0.15
 #: Radii of the plays, relative to the swing.
-_RADII = np.array([0.02, 0.05, 0.09, 0.14, 0.2, 0.27, 0.35, 0.45, 0.6, 0.8])
+RADII = np.array([0.02, 0.05, 0.09, 0.14, 0.2, 0.27, 0.35, 0.45, 0.6, 0.8])
 #: Lags (s) and whole-sample latencies among which the quasi-static description chooses.
 _LAGS_S = (0.0, 1e-3, 2.5e-3, 5e-3, 10e-3)
 _LATE = (0, 1, 3, 6)
@@ -180,7 +180,7 @@ class Readings:
             lagged = data.u_V if lag_s == 0.0 else np.asarray(lag_ends(data.u_V, lag_s / data.dt_s, False))
             for late in _LATE:
                 u = np.concatenate([np.full(late, lagged[0]), lagged[: data.n - late]]) if late else lagged
-                plays = play_run(u, _RADII * data.swing_V, np.full(_RADII.size, u[0]))
+                plays = play_run(u, RADII * data.swing_V, np.full(RADII.size, u[0]))
                 columns = np.stack([np.ones(data.n), u, *plays.T])
                 part = columns[:, use][:, ::thin]
                 target = data.y_um[use][::thin]

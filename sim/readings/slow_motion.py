@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 _TAUS_S = (0.1, 0.4, 1.6, 6.4, 25.0, 100.0)
 #: Standard errors from which a signature counts as seen.
 _SIGMAS = 3.8
+#: Time constants of a drift that settles, in the time that the cycles take.
+_SETTLES = (0.15, 0.3, 0.6, 1.2)
+#: Squared error beside a form, in that beside another form and of neighbouring cycles, that speaks against it.
+_CLEARLY = 4.0
 _WHEN = {"": "over the record", "early": "in its first half", "late": "in its second half"}
 
 
@@ -188,7 +192,7 @@ class CyclesOverTime:
     """What equal cycles show. ``missing``: what they lack to show anything; then nothing else is given.
 
     ``grew``: their height changes in time (None: it settles). ``moved``: their mean does, ``creeps`` clearly with the
-    logarithm of time, ``goes_on`` clearly with time. ``also``: what a change in time may be as well.
+    logarithm of time, ``goes_on`` clearly in another way. ``also``: what a change in time may be as well.
     """
 
     missing: str
@@ -213,8 +217,8 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
         tall_V, period = cycle.amplitude_V(data.u_V), cycle.period_s(data.dt_s)
         kinds.setdefault((round(math.log(tall_V) / 0.03), round(math.log(period) / 0.05)), []).append(cycle)
     same = max(kinds.values(), key=lambda c: (c[-1].stop - c[0].start) * min(len(c), 4), default=[])
-    # The first cycle of a kind still carries the history before it.
-    same = same[1:]
+    # The first cycle of a kind still carries the history before it; one that ends with the record may be cut short.
+    same = [cycle for cycle in same[1:] if cycle.stop < data.n - 1]
     if len(same) < 5 or (same[-1].stop - same[0].start) < 0.15 * data.n:
         return CyclesOverTime("no motion is repeated often enough, over long enough a time")
     t = np.array([0.5 * (c.start + c.stop) * data.dt_s for c in same])
@@ -227,19 +231,27 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     height = np.array(heights)
     relative = height / height.mean() - 1.0
     change, error = _slope(t, relative)
-    level = float(np.mean(means)) - data.middle_um + abs(data.centre_um)
-    means_um = np.array(means) - relative * level
+    # What of the mean goes with the height is a change of the gain, about some displacement that the stage reaches.
+    means_um = np.array(means)
+    if abs(change) > _SIGMAS * error:
+        level_um = float(relative @ means_um) / float(relative @ relative)
+        means_um -= relative * float(np.clip(level_um, -data.range_um, data.range_um))
     shift, shift_error = _slope(t, means_um)
     span = float(t[-1] - t[0])
     gained = abs(change * span) > 3e-4 and abs(change) > _SIGMAS * error
-    moved = abs(shift * span) > max(readings.sigma_um, 1e-4 * data.range_um) and abs(shift) > _SIGMAS * shift_error
     since = np.log10(t - same[0].start * data.dt_s + (t[1] - t[0]))
     settles = gained and _misfit(since, relative) < 0.9 * _misfit(t, relative)
-    creeps = moved and _misfit(since, means_um) < 0.7 * _misfit(t, means_um)
-    goes_on = moved and _misfit(t, means_um) < 0.7 * _misfit(since, means_um)
+    # A drift is a line or settles exponentially, creep goes with the logarithm; a mean that follows neither wanders.
+    drift = min(_misfit(t, means_um), *(_misfit(np.exp(-t / (share * span)), means_um) for share in _SETTLES))
+    creep, white = _misfit(since, means_um), float(np.sum(np.square(np.diff(means_um, n=2)))) / 6.0
+    wanders = min(drift, creep) > _CLEARLY * white
+    varies = abs(shift) > _SIGMAS * shift_error or _misfit(0.0 * t, means_um) > _CLEARLY * white
+    moved = varies and float(np.ptp(means_um)) > max(readings.sigma_um, 1e-4 * data.range_um)
+    creeps = moved and drift > _CLEARLY * (creep + white)
+    goes_on = moved and (creep > _CLEARLY * (drift + white) or wanders)
     n = len(same)
     per_decade, per_decade_error = _slope(since, means_um)
-    manner = "the logarithm of time" if creeps else "time" if goes_on else "neither time nor its logarithm"
+    manner = "the logarithm of time" if creeps else "time" if goes_on else "time or its logarithm"
     mean_words = (
         f"the mean of {n} equal cycles changes by {shift * span:.2g} µm in {span:.3g} s, and goes with {manner}"
     )
@@ -268,6 +280,6 @@ def _misfit(t: FloatArray, v: FloatArray) -> float:
 def _slope(t: FloatArray, v: FloatArray) -> tuple[float, float]:
     """Slope of v over t and its standard error."""
     x = t - t.mean()
-    slope = float(x @ v / (x @ x))
+    slope = float(x @ v / max(float(x @ x), 1e-300))
     left = v - v.mean() - slope * x
-    return slope, float(np.sqrt(left @ left / max(1, t.size - 2) / (x @ x)))
+    return slope, float(np.sqrt(left @ left / max(1, t.size - 2) / max(float(x @ x), 1e-300)))

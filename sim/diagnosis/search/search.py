@@ -33,6 +33,9 @@ from sim.readings.noise import has_spectral_line
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
 
+#: Least squared error that a line must remove, in that of the noise: half the square of a twentieth of its deviation.
+_LINE = 0.5 * 0.05**2
+
 
 @dataclass(frozen=True)
 class Thresholds:
@@ -235,6 +238,8 @@ class Search:
 
     def __post_init__(self) -> None:
         self.causes = self.causes or self.catalogue.forms
+        if self.readings is not None:
+            self.causes = tuple(cause.shown(self.readings) for cause in self.causes)
 
     def seen(self, cause: CauseModel) -> bool:
         """Whether a direct test sees this cause that answers to it alone, or gives the number that the fit has."""
@@ -386,8 +391,11 @@ class Search:
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
         if best.cause.line_hz(q) is not None:
-            return gain > 30.0 * self.sigma_um**2 and self.is_line(best.cause, q, base)
-        if len(parameters) == 1 and (q[0] <= parameters[0].low or q[0] >= parameters[0].high):
+            # A line of less than a twentieth of the noise is none that matters.
+            return gain > _LINE * float(self.mask.sum()) * self.sigma_um**2 and self.is_line(best.cause, q, base)
+        ends = [v != s.neutral and not s.low < v < s.high for s, v in zip(parameters, q, strict=True) if not s.linear]
+        if len(parameters) <= 2 and any(ends):
+            # A number at its bound is none that was found. Of the many of a free form some may be.
             return False
         if not self.plausible(best):
             return False
@@ -533,7 +541,9 @@ class Search:
         """The guesses beside the causes of ``fit``, without those that the review dropped."""
         names = {cause.name for cause in fit.model.causes}
         dropped = {cause.name for cause in self.unsteady} | self.uncertain
-        return self.looks(fit, self.catalogue.same_set(names) | dropped)
+        # What a direct test cannot tell from a cause that is there, and is seen by the same, is that cause once more.
+        either = {other for name in names for other in self.shown_as_well(name) if name in self.shown_as_well(other)}
+        return self.looks(fit, self.catalogue.same_set(names) | dropped | either)
 
     def _last(self, candidate: CauseCandidate, index: int) -> tuple[CauseCandidate, ModelFit]:
         """An earlier cause of a candidate's model as the candidate, and the model without it."""

@@ -153,8 +153,20 @@ def test_the_next_experiment_lets_a_direct_test_see_what_only_the_fit_names(tau_
     assert witnesses(Readings(data, mask, 0.005))["sensor_lag"].seen is None
     nominal = calibrate_nominal("bouc_wen", data, mask)
     fit = evaluate(nominal.model.with_cause(SensorLag("sensor_lag")), np.append(nominal.p, tau_s), mask)
-    sentence = next_experiment([], (), ("sensor_lag",), fit, 0.005, CATALOGUE)
+    sentence = next_experiment([], [], (), ("sensor_lag",), False, fit, 0.005, CATALOGUE)
     assert ("see sensor_lag" in str(sentence)) is said
+
+
+def test_what_is_open_always_has_a_next_experiment() -> None:
+    data = with_nominal_kind("bouc_wen", stage(seed=7))
+    fit = calibrate_nominal("bouc_wen", data, np.ones(data.n, dtype=np.bool_))
+
+    def said(sets: list[tuple[str, ...]], unexplained: bool) -> str | None:
+        return next_experiment([], sets, (), (), unexplained, fit, 0.005, CATALOGUE)
+
+    assert said([], False) is None
+    assert "three rates" in str(said([], True))
+    assert "asymmetry from sensor_nonlinearity" in str(said([("asymmetry", "sensor_nonlinearity")], False))
 
 
 def test_the_other_axis_is_the_next_experiment_only_on_a_rig_that_has_one() -> None:

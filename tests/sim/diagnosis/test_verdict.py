@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
@@ -20,7 +21,7 @@ from sim.diagnosis.search.held_out import split
 from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import ModelFit
-from sim.readings.noise import RepeatedReadings, noise_floor, recording_defects, repeated_readings
+from sim.readings.noise import RepeatedReadings, is_noise, noise_floor, recording_defects, repeated_readings
 
 DT = 1e-3
 SIGMA_UM = 0.01
@@ -43,27 +44,42 @@ def cause(index: int = 0) -> NamedCause:
 
 
 @pytest.mark.parametrize(
-    ("causes", "nominal", "extended", "ceiling", "verdict"),
+    ("causes", "nominal", "extended", "ceiling", "noise", "verdict"),
     [
-        ((), 0.0102, 0.0102, 0.01, "adequate"),
-        ((), 0.1, 0.1, 0.02, "unexplained"),
-        # Coloured noise: above the floor, but a black box does not predict it either.
-        ((), 0.08, 0.08, 0.076, "adequate"),
-        # Far above the floor in the rests it is no noise, even where the black box does worse than the stage.
-        ((), 0.5, 0.5, 0.6, "unexplained"),
-        ((cause(),), 0.5, 0.01, 0.01, "effects"),
-        ((cause(),), 0.5, 0.3, 0.02, "partly"),
-        ((cause(),), 0.5, 0.49, 0.02, "unexplained"),
+        ((), 0.0102, 0.0102, 0.01, False, "adequate"),
+        ((), 0.1, 0.1, 0.02, False, "unexplained"),
+        # Noise of a colour is above the floor, but not far.
+        ((), 0.08, 0.08, 0.02, True, "adequate"),
+        ((), 0.5, 0.5, 0.02, True, "unexplained"),
+        # That a black box fails as well does not make an error noise.
+        ((), 0.08, 0.08, 0.076, False, "unexplained"),
+        ((cause(),), 0.5, 0.01, 0.01, False, "effects"),
+        ((cause(),), 0.5, 0.3, 0.02, False, "partly"),
+        ((cause(),), 0.5, 0.49, 0.02, True, "unexplained"),
         # On a test record the error grew: nothing carries over.
-        ((cause(),), 2.19, 4.42, 1.0, "unexplained"),
-        ((cause(-1),), 0.011, 0.011, 0.011, "effects"),
+        ((cause(),), 2.19, 4.42, 1.0, False, "unexplained"),
+        ((cause(-1),), 0.011, 0.011, 0.011, False, "effects"),
     ],
 )
 def test_the_verdict_can_fail(
-    causes: tuple[NamedCause, ...], nominal: float, extended: float, ceiling: float, verdict: str
+    causes: tuple[NamedCause, ...], nominal: float, extended: float, ceiling: float, noise: bool, verdict: str
 ) -> None:
     explained = explained_share(nominal, extended, ceiling, 0.01)
-    assert verdict_of(causes, nominal, extended, ceiling, 0.01, explained) == verdict
+    assert verdict_of(causes, nominal, extended, noise, 0.01, explained) == verdict
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_any_colour_is_noise_and_an_error_that_follows_the_drive_is_not(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 20_000
+    t, white, whole = np.arange(n) * DT, rng.standard_normal(n), np.ones(n, dtype=np.bool_)
+    correlated = lfilter([0.02], [1.0, -0.98], white)
+    f = np.maximum(np.fft.rfftfreq(n, DT), 1.0 / (n * DT))
+    pink = np.fft.irfft(np.fft.rfft(white) / np.sqrt(f), n)
+    error = np.abs(np.sin(2.0 * np.pi * 1.0 * t)) - 2.0 / np.pi
+    for noise in (white, correlated / correlated.std(), pink / pink.std()):
+        assert is_noise(noise, whole)
+        assert not is_noise(noise + 3.0 * error, whole)
 
 
 def linear_record(seed: int, extra: FloatArray | float = 0.0, seconds: float = 20.0) -> FitData:

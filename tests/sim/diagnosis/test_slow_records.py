@@ -1,0 +1,91 @@
+"""Records of a stack at 200 Hz under a sine of 1 Hz: what their readings say of time, drifts and the start."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from adaptive.types import FloatArray
+from sim.diagnosis.diagnose import without_start
+from sim.diagnosis.witnesses import witnesses
+from sim.effects.mains_hum import MainsHum
+from sim.fitting.fit_data import FitData
+from sim.readings.readings import Readings
+from sim.readings.sight import Sight
+from tests.foreign.inject import inject
+
+DT, N = 0.005, 4000
+SIGMA_UM = 0.05
+
+
+def sine() -> tuple[FloatArray, FloatArray]:
+    """Voltage, and readings (µm) of a loop of plays with a bend that no description knows exactly."""
+    rng = np.random.default_rng(0)
+    u = 1.8 + 1.8 * np.sin(2.0 * np.pi * DT * np.arange(N))
+    y, weights = 8.0 * u + 0.4 * np.sin(1.3 * u), rng.uniform(0.1, 0.3, 25)
+    for radius, weight in zip(np.linspace(0.05, 1.6, 25), weights, strict=True):
+        at = u[0]
+        for k in range(N):
+            at = min(max(at, u[k] - radius), u[k] + radius)
+            y[k] += weight * at
+    return u, y + SIGMA_UM * rng.standard_normal(N)
+
+
+def sights(cause: str, seed: int = 3) -> tuple[dict[str, Sight], dict[str, float]]:
+    u, y, truth = inject(DT, *sine(), cause, np.random.default_rng(seed)) if cause else (*sine(), {})
+    return witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM)), truth
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_lost_samples_and_a_wrong_clock_are_seen_in_slow_motion(seed: int) -> None:
+    slips, lost = sights("slips", seed)
+    assert slips["timing"].seen is True, slips["timing"].words
+    assert f"{lost['lost_samples'] / 2:+.0f} from" in slips["timing"].words
+    clock, truth = sights("clock", seed)
+    assert clock["timing"].seen is True, clock["timing"].words
+    said = -float(clock["timing"].words.split("changes by ")[1].split()[0])
+    assert said == pytest.approx(truth["clock_ppm"], rel=0.15)
+
+
+@pytest.mark.parametrize("cause", ["", "gain_drift", "thermal_exponential", "creep", "bow", "sensor_lag", "resonance"])
+def test_what_does_not_act_on_time_is_no_timing(cause: str) -> None:
+    assert sights(cause)[0]["timing"].seen is not True
+
+
+@pytest.mark.parametrize("cause", ["thermal_line", "thermal_exponential", "thermal_walk"])
+def test_a_drift_of_any_form_is_seen_in_equal_cycles(cause: str) -> None:
+    found = sights(cause)[0]
+    assert found["thermal_drift"].seen is True, found["thermal_drift"].words
+    # One that settles may be creep: then both are one set.
+    assert found["creep"].seen is not True or "creep" in found["thermal_drift"].also, found["creep"].words
+
+
+def test_a_gain_that_drifts_about_the_middle_moves_no_mean() -> None:
+    found = sights("gain_drift")[0]
+    assert found["gain_drift"].seen is True, found["gain_drift"].words
+    assert found["thermal_drift"].seen is not True, found["thermal_drift"].words
+
+
+def test_a_hum_of_two_percent_of_the_range_is_within_its_bounds() -> None:
+    data = FitData(DT, *sine())
+    assert MainsHum().parameters(data)[1].high > 0.02 * data.range_um
+
+
+def test_readings_that_end_at_a_limit_are_seen_and_those_on_a_coarse_grid_are_not() -> None:
+    assert sights("clipped_reading")[0]["saturation"].seen is True
+    assert sights("quantisation")[0]["saturation"].seen is not True
+    assert sights("")[0]["saturation"].seen is not True
+
+
+def test_a_ring_down_at_the_start_is_left_out_and_an_equal_one_later_is_not() -> None:
+    rng = np.random.default_rng(1)
+    residual, whole = 0.05 * rng.standard_normal(8000), np.ones(8000, dtype=np.bool_)
+    t = np.arange(300) * 1e-3
+    ring = 2.0 * np.exp(-t / 0.015) * np.cos(2.0 * np.pi * 300.0 * t)
+    start = residual.copy()
+    start[:300] += ring
+    assert 0.04 <= float(np.flatnonzero(without_start(whole, start, 1e-3))[0]) * 1e-3 <= 0.09
+    both = start.copy()
+    both[4000:4300] += ring
+    assert without_start(whole, both, 1e-3).all()
+    assert np.count_nonzero(~without_start(whole, residual, 1e-3)) <= 10
