@@ -177,6 +177,27 @@ def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
     assert "swapped" not in kinds(negative)
 
 
+def test_exchanged_columns_of_a_recording_that_ends_away_from_its_start_are_refused() -> None:
+    part = healthy().part(0, 250)
+    part = replace(part, u_V=150.0 / np.ptp(part.u_V) * part.u_V)
+    assert abs(part.u_V[-1] - part.u_V[0]) > 0.5 * np.ptp(part.u_V)
+    assert "swapped" not in kinds(part)
+    exchanged = replace(part, u_V=part.y_um, y_um=part.u_V)
+    assert kinds(exchanged)["swapped"] == "refusal"
+    assert lead(part.y_um, part.u_V) == pytest.approx(-lead(part.u_V, part.y_um))
+
+
+def test_a_displacement_that_is_a_line_of_the_voltage_is_refused() -> None:
+    base = healthy()
+    coarse = np.round(base.u_V / 0.003) * 0.003
+    for u_V, y_um in ((base.u_V, 9.0 * base.u_V + 4.0), (coarse, np.round(-8.0 * base.u_V, 4))):
+        target = replace(base, u_V=u_V, y_um=y_um)
+        with pytest.raises(InputError, match=r"y_um: a straight line of u_V.*a target, or a copy.*--column y="):
+            require_usable(target, check(target))
+    counts = replace(base, y_um=np.round(base.y_um / 0.5) * 0.5)
+    assert "line" not in kinds(counts)
+
+
 def test_a_command_that_rests_under_a_noisy_sensor_is_not_exchanged_where_the_clock_lets_readings_lead() -> None:
     ahead = recording_of(pair(820))
     assert lead(ahead.u_V, ahead.y_um) > LARGEST_LEAD
