@@ -100,6 +100,8 @@ def check(recording: Recording) -> list[Finding]:
         if (finding := _not_finite(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
+            if finding.count == n:
+                continue
         if (finding := _constant(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
@@ -134,7 +136,7 @@ def _time_base(recording: Recording) -> list[Finding]:
         found.append(Finding("not_finite", "warning", "t_s", len(bad), (), message))
     with np.errstate(invalid="ignore"):
         steps = np.diff(t_s)
-        gaps = np.flatnonzero(steps > 1.5 * dt)
+        gaps = np.flatnonzero((steps > 1.5 * dt) & np.isfinite(steps))
         back = np.flatnonzero(steps < -0.5 * dt)
         doubled = np.flatnonzero((steps >= -0.5 * dt) & (steps < 0.5 * dt))
     if len(gaps):
@@ -160,7 +162,7 @@ def _time_base(recording: Recording) -> list[Finding]:
         )
         found.append(Finding("unit", "warning", "t_s", len(t_s), (), message))
     regular = steps[np.isfinite(steps) & (steps >= 0.5 * dt) & (steps <= 1.5 * dt)]
-    jitter = float(np.std(regular) / dt) if len(regular) else 0.0
+    jitter = float(np.std(regular / dt)) if len(regular) else 0.0
     if jitter > 0.02:
         message = f"sample times jitter by {100 * jitter:.1f} % of {dt:g} s (one standard deviation): a software clock?"
         found.append(Finding("jitter", "warning", "t_s", len(regular), (), message))
@@ -276,13 +278,24 @@ def _line(recording: Recording) -> list[Finding]:
 
 def on_a_line(u: FloatArray, y: FloatArray) -> bool:
     """Whether ``y`` (n,) is a straight line of ``u`` (n,) within the smallest steps of both: no sensor's reading."""
-    good = np.isfinite(u) & np.isfinite(y)
-    if not good.any() or np.ptp(u[good]) == 0.0 or np.ptp(y[good]) == 0.0:
+    u, y = _centred(u, y)
+    if not u.size or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
         return False
-    u, y = u[good] - np.mean(u[good]), y[good] - np.mean(y[good])
     gain = float(np.sum(u * y) / np.sum(u**2))
-    digits = sum(float(np.min(np.diff(np.unique(np.round(x, 12))))) for x in (gain * u, y) if gain)
-    return float(np.max(np.abs(y - gain * u))) <= digits + ROUND_OFF * float(np.ptp(y))
+    steps = [np.diff(np.unique(np.round(x, 12))) for x in (gain * u, y)]
+    digits = sum(float(np.min(step, initial=1.0)) for step in steps)
+    return float(np.max(np.abs(y - gain * u))) <= digits + ROUND_OFF
+
+
+def _centred(u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both (m,) where both are finite, without their means and over their ranges."""
+    good = np.isfinite(u) & np.isfinite(y)
+    if not good.any():
+        return np.empty(0), np.empty(0)
+    # A span below the smallest normal number is none.
+    least = float(np.finfo(np.float64).tiny)
+    over = [np.asarray(x[good], dtype=np.float64) / max(float(np.ptp(x[good])), least) for x in (u, y)]
+    return over[0] - np.mean(over[0]), over[1] - np.mean(over[1])
 
 
 def _swap(recording: Recording) -> list[Finding]:
@@ -305,8 +318,7 @@ def lead(u: FloatArray, y: FloatArray) -> float:
     the sign of the gain. Exchanged columns have the same lead with the other sign. Samples that are not finite are left
     out.
     """
-    good = np.isfinite(u) & np.isfinite(y)
-    u, y = u[good] - np.mean(u[good]), y[good] - np.mean(y[good])
+    u, y = _centred(u, y)
     area = 0.5 * float(np.sum((np.roll(u, -1) - np.roll(u, 1)) * y))
     # The noise of a sensor adds to its slope: the smoother of the two counts.
     size = float(
@@ -338,12 +350,12 @@ def _rests_under_noise(u: FloatArray, y: FloatArray) -> bool:
 
 def swapped(u: FloatArray, y: FloatArray) -> Literal["no", "likely", "certain"]:
     """Whether ``u`` and ``y`` look exchanged: a displacement cannot lead its voltage, and only a sensor is noisy."""
-    good = np.isfinite(u) & np.isfinite(y)
-    if np.count_nonzero(good) < 3 or np.ptp(u[good]) == 0.0 or np.ptp(y[good]) == 0.0:
+    good_u, good_y = _centred(u, y)
+    if good_u.size < 3 or np.ptp(good_u) == 0.0 or np.ptp(good_y) == 0.0:
         return "no"
-    if abs(float(np.corrcoef(u[good], y[good])[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
+    if abs(float(np.corrcoef(good_u, good_y)[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
         return "no"
-    if _rests_under_noise(u[good], y[good]):
+    if _rests_under_noise(good_u, good_y):
         # Beside a recorder whose clock runs fast, readings come before their steps.
         return "no"
     return "certain" if roughness(u) > 3.0 * roughness(y) else "likely"

@@ -153,6 +153,18 @@ def test_not_finite() -> None:
         require_usable(ridden, check(ridden))
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("column", ["t_s", "u_V", "y_um", "monitor_V"])
+@pytest.mark.parametrize("values", [np.nan, np.inf, 1e300, 1e-310])
+def test_columns_beyond_arithmetic_give_findings_and_no_warnings(column: str, values: float) -> None:
+    base = replace(healthy(), monitor_V=healthy().u_V)
+    with np.errstate(invalid="ignore"):
+        whole = getattr(base, column) * values
+    found = check(replace(base, **{column: whole}))
+    assert {finding.column for finding in found} & {column, ""}
+    check(replace(base, **{column: np.where(np.arange(len(base)) % 5 == 0, whole, getattr(base, column))}))
+
+
 @pytest.mark.parametrize("column", ["u_V", "y_um"])
 @pytest.mark.parametrize("level", [0.0, 2.5])
 def test_all_zero_and_constant_are_refused(column: str, level: float) -> None:
