@@ -174,7 +174,7 @@ def _table(path: Path, digest: Any, mapping: ColumnMap) -> Table:
         raise InputError(f"{path}: is {_REFUSED[ending]}")
     table = _read_as(path, ending, _head(path, digest), mapping)
     if not table.arrays:
-        raise InputError(f"{path}: holds no arrays of numbers ({table.describe()}), expected one value per sample")
+        raise InputError(f"{path}: holds no arrays of numbers, but {table.describe()}; expected one value per sample")
     return table
 
 
