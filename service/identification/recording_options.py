@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -185,17 +186,20 @@ def to_paste(args: argparse.Namespace, options: Sequence[str]) -> str:
     )
 
 
-#: Words in proposed options that the user replaces, with what they are.
-_OPEN = {
-    "HZ": "HZ (samples per second)",
-    "FILE": "FILE (the file with it)",
-    "FACTOR": "FACTOR (µm per unit in the file)",
-}
-
-
 def to_fill_in(options: Sequence[str]) -> str:
     """What to fill in in proposed options, as the end of a sentence; "" for nothing."""
-    found = [what for word, what in _OPEN.items() if any(option.endswith(word) for option in options)]
+    found = []
+    for option in options:
+        _, quantity, word = re.split("[ =]", f"{option}=", maxsplit=2)
+        word = word.rstrip("=") or quantity
+        canonical, factors = QUANTITIES.get(quantity, ("", {}))
+        own = canonical.rpartition("_")[2].replace("um", "µm")
+        found += {
+            "HZ": ["HZ (samples per second)"],
+            "FILE": [f"FILE of {quantity} (the file with it)"],
+            "FACTOR": [f"FACTOR of {quantity} ({own} per unit in the file)"],
+            "UNIT": [f"UNIT of {quantity} ({', '.join(factors)})"],
+        }.get(word, [])
     return f", and fill in {', '.join(found)}" if found else ""
 
 

@@ -203,9 +203,8 @@ class _Hdf5:
         if "MATLAB_empty" in member.attrs:
             return "empty"
         if matlab and matlab not in ("double", "single", "logical") and not matlab.startswith(("int", "uint")):
-            return {"char": "text", "cell": "cells"}.get(matlab, f"a {matlab}") + (
-                "" if matlab != "struct" else " array"
-            )
+            save = ": save its columns as arrays" if "table" in matlab or matlab == "timeseries" else ""
+            return {"char": "text", "cell": "cells", "struct": "a struct array"}.get(matlab, f"a {matlab}{save}")
         if member.dtype.kind in "fiub" or member.dtype.names is not None:
             return ""
         return "no numbers"

@@ -41,6 +41,10 @@ _UNIT_WORDS = {
     **dict.fromkeys(("°c", "deg c", "celsius"), "C"),
     **dict.fromkeys(("kelvin",), "K"),
     **dict.fromkeys(("hertz",), "Hz"),
+    # Units of other kinds, which need a factor.
+    **{name: name for name in ("mrad", "rad", "arcsec", "arcmin", "deg", "ohm", "counts")},
+    **dict.fromkeys(("urad", "μrad"), "urad"),
+    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
 }
 
 #: quantity -> (canonical column, factors to its unit by unit name)
@@ -248,26 +252,38 @@ def column_by_unit(quantity: str, names: list[str], units: Mapping[str, str], ta
 
 #: Names of a time, in lower case.
 TIME_WORDS = ("time", "zeit", "temps", "t", "x_value", "timestamp", "x", "x-axis", "x axis")
+#: Words of a wanted value, which is no reading.
+_WANTED = ("target", "command", "setpoint", "set point", "demand", "desired", "reference", "soll", "consigne")
+#: Words of a reading, which drives nothing.
+_READING = ("pos", "displ", "sensor", "weg", "auslenkung", "measured", "monitor")
 #: Words in the names of columns, for a proposal that the user checks; never used without a word from the user.
 _WORDS = {
     "t": TIME_WORDS,
     "u": ("volt", "drive", "command", "spannung", "tension", "piezo", "output", "ao", "dac", "ch1", "u", "1"),
-    "y": ("pos", "displ", "sensor", "weg", "auslenkung", "measured", "input", "ai", "adc", "ch2", "y", "2"),
+    "y": (*_READING, "input", "ai", "adc", "ch2", "y", "2"),
 }  # fmt: skip
 
 
-def proposed_column(quantity: str, names: list[str], taken: Collection[str]) -> str | None:
-    """A column to propose for a quantity: by its name, else the first that is not taken; None where there is none.
-
-    For the time by its name only.
-    """
-    free = [name for name in names if name not in taken]
+def named_column(quantity: str, names: list[str]) -> str | None:
+    """The column with a word of the quantity in its name; None where there is none."""
     for word in _WORDS.get(quantity, ()):
-        for name in free:
+        for name in names:
             if name.casefold() == word or (len(word) > 2 and word in name.casefold()):
                 return name
-    rest = [name for name in free if name.casefold() not in ("index", *_WORDS.get("t", ()))] or free
-    return rest[0] if rest and quantity != "t" else None
+    return None
+
+
+def may_be(quantity: str, name: str, unit: str | None) -> bool:
+    """Whether a column may be proposed for ``u`` or ``y`` by its name and the unit that it states (None for none).
+
+    A target is no reading, and drives only where it is in volts. A reading drives nothing. A sensor may be in a unit of
+    another kind, with a factor.
+    """
+    wanted, reading = (any(word in name.casefold() for word in words) for words in (_WANTED, _READING))
+    length, volts = unit in _LENGTH, unit in _VOLTAGE
+    if unit in _TIME or unit in _TEMPERATURE or unit in _RATE:
+        return False
+    return not wanted if quantity.startswith("y") else (volts if wanted or length else not reading)
 
 
 class MissingError(InputError):
@@ -326,6 +342,6 @@ def factor_and_unit(
             f"{source}: column {column!r} for {quantity} has no unit in its name, and units are never guessed; "
             f"{accepted}",
             f"the unit of column {column!r} for {quantity}: {', '.join(factors)}",
-            f"--unit {quantity}={own}",
+            f"--unit {quantity}=UNIT",
         )
     return factors[unit], unit

@@ -25,6 +25,7 @@ from sim.recordings.text_formats import (
     encoding_of,
     has_names,
     is_number,
+    opened,
     plain_number,
     split_cells,
     units_row,
@@ -59,11 +60,12 @@ _IN_ONE_CELL: Final = re.compile(r"(t0|tinc)\s*=\s*(\S+)", re.IGNORECASE)
 _TIME_OF_DAY: Final = re.compile(
     r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,:]\d*)?)(?: ?([AaPp])[Mm])?"
 )
-#: A number with thousands separated, by its decimal sign.
+#: A number with thousands separated, by its decimal sign. ``1.000`` alone is one only where points are no decimals.
 _THOUSANDS: Final = {
-    ",": re.compile(r"[+-]?\d{1,3}([.'\u2019\u00a0\u202f ]\d{3})+(,\d+)?(?<!\.\d{3})"),
-    ".": re.compile(r"[+-]?\d{1,3}([,'\u2019\u00a0\u202f ]\d{3})+(\.\d+)?(?<!,\d{3})"),
+    ",": re.compile(r"[+-]?[1-9]\d{0,2}((\.\d{3}){2,}(,\d+)?|(\.\d{3})+,\d+|(['\u2019\u00a0\u202f ]\d{3})+(,\d+)?)"),
+    ".": re.compile(r"[+-]?[1-9]\d{0,2}((,\d{3}){2,}(\.\d+)?|(,\d{3})+\.\d+|(['\u2019\u00a0\u202f ]\d{3})+(\.\d+)?)"),
 }
+_ONE_THOUSAND: Final = {",": re.compile(r"[+-]?[1-9]\d{0,2}\.\d{3}"), ".": re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")}
 #: What separates thousands, with its name for people.
 _SEPARATORS: Final = {
     ".": "points", ",": "commas", "'": "apostrophes", "\u2019": "apostrophes", "\u00a0": "blanks",
@@ -85,7 +87,6 @@ class Layout:
     columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
     units : name -> unit, where the file states it apart from the name.
     dt_s : sample time that the preamble states, s, or None. notes : what was found, for people.
-    thousands : what separates thousands in the first lines, "" for nothing.
     heads : lines of names and units, without blanks, which may come again between the rows.
     """
 
@@ -100,7 +101,6 @@ class Layout:
     units: dict[str, str] = field(default_factory=dict)
     dt_s: float | None = None
     notes: tuple[str, ...] = ()
-    thousands: str = ""
     heads: frozenset[str] = frozenset()
 
 
@@ -120,7 +120,7 @@ def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
 
 def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
     layout = _layout_of(path, encoding, mapping)
-    with path.open(encoding=encoding, newline=None) as file:
+    with opened(path, encoding) as file:
         for _ in range(layout.start):
             next(file, None)
         rows = _Rows(path, layout, path.stat().st_size)
@@ -136,7 +136,7 @@ def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
 
 
 def _layout_of(path: Path, encoding: str, mapping: ColumnMap) -> Layout:
-    with path.open(encoding=encoding, newline=None) as file:
+    with opened(path, encoding) as file:
         lines = list(itertools.islice(file, _HEAD_LINES))
         try:
             return find_layout(str(path), lines, encoding, mapping)
@@ -207,15 +207,22 @@ def _is_comment(line: str) -> bool:
     return line.lstrip()[:1] in ("#", "%") or not line.strip()
 
 
-def _kind(cell: str, decimal: str) -> str:
-    """n: number, e: empty or missing, d: a date or time of day, t: any other text."""
+def _kind(cell: str, decimal: str, grouped: bool = False) -> str:
+    """n: number, e: empty or missing, d: a date or time of day, t: any other text.
+
+    ``grouped`` : whether other cells show that thousands are separated.
+    """
     if cell.casefold() in _MISSING:
         return "e"
-    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _THOUSANDS[decimal].fullmatch(
-        plain_number(cell)
-    ):
+    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _grouped(cell, decimal, grouped):
         return "n"
     return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY, _DURATION)) else "t"
+
+
+def _grouped(cell: str, decimal: str, known: bool) -> bool:
+    """Whether a cell is a number with its thousands separated; ``known``: others show that they are."""
+    plain = plain_number(cell)
+    return bool(_THOUSANDS[decimal].fullmatch(plain) or (known and _ONE_THOUSAND[decimal].fullmatch(plain)))
 
 
 def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) -> _Block | None:
@@ -225,11 +232,9 @@ def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) ->
     of numbers and in half of the others is one of them: a wrong cell in it is a fault, not a preamble.
     """
     least = 0 if named is None else named + 1
-    rows = [
-        (k, [_kind(cell, decimal) for cell in split_cells(line, delimiter)])
-        for k, line in enumerate(lines)
-        if k >= least and not _is_comment(line)
-    ]
+    cells = [(k, split_cells(line, delimiter)) for k, line in enumerate(lines) if k >= least and not _is_comment(line)]
+    grouped = any(_grouped(cell, decimal, False) for _, row in cells for cell in row)
+    rows = [(k, [_kind(cell, decimal, grouped) for cell in row]) for k, row in cells]
     while rows and "n" not in rows[-1][1]:  # names without samples, or a last row that was cut off
         rows.pop()
     if not rows:
@@ -326,7 +331,7 @@ def _layout(
                 sign
                 for line in lines[start:]
                 for cell in split_cells(line.strip("\r\n"), block.delimiter)
-                if _THOUSANDS[block.decimal].fullmatch(cell)
+                if _grouped(cell, block.decimal, False)
                 for sign in _SEPARATORS
                 if sign in cell and sign != block.decimal
             }
@@ -336,7 +341,7 @@ def _layout(
         notes.append(f"thousands separated by {_SEPARATORS[thousands[0]]}")
     return Layout(
         encoding, block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
-        (*said, *notes), thousands, frozenset(lines[k].strip() for k in above[-2:]),
+        (*said, *notes), frozenset(lines[k].strip() for k in above[-2:]),
     )  # fmt: skip
 
 
@@ -424,7 +429,8 @@ def _names_and_units(
         units = units_row(names, _fit(lines[stated], block, columns))
         # Above a whole row of units, numbers are names of channels.
         plain = not any(is_number(cell, block.decimal) for cell in upper)
-        if len(units) == len(names) or (units and plain and k == len(above)):
+        whole = len(units) == len(names) and all(map(stated_unit, units.values()))
+        if whole or (units and plain and k == len(above)):
             return names, units, [_units_note(stated, units)]
     return None
 
@@ -432,10 +438,11 @@ def _names_and_units(
 def _traces(
     lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
 ) -> tuple[list[str], dict[str, str]] | None:
-    """The names of the columns where a line of the preamble begins with the word ``TraceName``."""
+    """The names of the columns where a line of the preamble begins with the word ``TraceName``, or Igor's ``WAVES``."""
     for k in above:
         cells = _cells_of(lines[k], block.delimiter)
-        if cells and cells[0].casefold() == "tracename" and len(cells) == len(columns) + 1:
+        word = cells[0].casefold().partition("/")[0] if cells else ""
+        if word in ("tracename", "waves") and len(cells) == len(columns) + 1:
             return different(cells[1:]), {}
     return None
 
@@ -561,7 +568,7 @@ class _Rows:
         self._line += len(lines)
         if last:
             lines = self._without_tail(lines)
-        block = None if self._texts or self.layout.thousands else self._fast(lines)
+        block = None if self._texts else self._fast(lines)
         if block is None:
             block = self._slow(lines, numbered, last)
         n = block.shape[1]
@@ -589,7 +596,7 @@ class _Rows:
         first = {layout.columns[self._numbers[0]]: "ne"} if self._numbers else {}
         times = {at: "de" for at, kind in zip(layout.columns, layout.kinds, strict=True) if kind == "d"}
         return bool(cells) and all(
-            at in cells and _kind(cells[at], layout.decimal) in kinds for at, kinds in {**first, **times}.items()
+            at in cells and _kind(cells[at], layout.decimal, True) in kinds for at, kinds in {**first, **times}.items()
         )
 
     def _reserve(self, n: int, characters: int) -> None:
@@ -617,7 +624,8 @@ class _Rows:
             count = layout.width - 1
             if any(line.count(delimiter) != count for line in lines if line.strip()):
                 return None
-        if layout.delimiter == layout.decimal:
+        # A point beside decimal commas separates thousands.
+        if layout.delimiter == layout.decimal or (layout.decimal == "," and any("." in line for line in lines)):
             return None
         source = (line.replace(",", ".") for line in lines) if layout.decimal == "," else lines
         usecols = None if self._whole else [layout.columns[i] for i in self._numbers]
@@ -661,14 +669,14 @@ class _Rows:
 
     def _column(self, i: int, cells: list[str]) -> FloatArray:
         comma = self.layout.decimal == ","
-        if not self.layout.thousands:
+        if not (comma and any("." in cell for cell in cells)):
             try:
                 return np.array([cell.replace(",", ".") for cell in cells] if comma else cells, dtype=np.float64)
             except ValueError:
                 pass
         values = np.full(len(cells), np.nan)
         for row, cell in enumerate(cells):
-            value = _number(cell, self.layout.decimal, self.layout.thousands)
+            value = _number(cell, self.layout.decimal)
             if value is not None:
                 values[row] = value
             elif cell.casefold() not in _MISSING:
@@ -693,12 +701,13 @@ class _Rows:
         return found, stamped
 
 
-def _number(cell: str, decimal: str, thousands: str) -> float | None:
-    """A cell as a number; None where it is none. ``thousands``: what separates them in other rows."""
+def _number(cell: str, decimal: str) -> float | None:
+    """A cell as a number; None where it is none."""
     plain = plain_number(cell)
-    separators = thousands or ("".join(_SEPARATORS) if _THOUSANDS[decimal].fullmatch(plain) else "")
-    for sign in separators:
-        plain = plain if sign == decimal else plain.replace(sign, "")
+    if _grouped(cell, decimal, True):
+        plain = "".join(sign for sign in plain if sign == decimal or sign not in _SEPARATORS)
+    elif decimal == "," and "." in plain:
+        return None
     try:
         return float(plain.replace(",", ".") if decimal == "," else plain)
     except ValueError:

@@ -38,6 +38,8 @@ LONGER = 2
 LARGEST_LEAD = 0.02
 #: Samples without any change that count as a rest of the command.
 LEAST_REST = 50
+#: Share of a range within which arithmetic rounds.
+ROUND_OFF = 1e-9
 #: Below this correlation the columns do not form a loop, and are not judged.
 LEAST_CORRELATION = 0.8
 #: Share of samples with the time of the one before from which the time has too few digits.
@@ -53,7 +55,7 @@ class Finding:
     Attributes
     ----------
     kind : fixed name of the problem (``gap``, ``doubled``, ``backwards``, ``jitter``, ``not_finite``, ``dropout``,
-        ``clipped``, ``all_zero``, ``constant``, ``too_short``, ``swapped``, ``unit``, ``note``).
+        ``clipped``, ``all_zero``, ``constant``, ``line``, ``too_short``, ``swapped``, ``unit``, ``note``).
     severity : ``note``, ``warning`` or ``refusal``.
     column : canonical column, or "" for the whole recording.
     count : number of samples or places.
@@ -98,6 +100,8 @@ def check(recording: Recording) -> list[Finding]:
         if (finding := _not_finite(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
+            if finding.count == n:
+                continue
         if (finding := _constant(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
@@ -107,7 +111,7 @@ def check(recording: Recording) -> list[Finding]:
         found += _plausible(recording, name, values)
     if values_are_sound:
         found += _repeats(recording)
-        found += _swap(recording)
+        found += _line(recording) or _swap(recording)
     order = {"refusal": 0, "warning": 1, "note": 2}
     return sorted(found, key=lambda finding: order[finding.severity])
 
@@ -132,7 +136,7 @@ def _time_base(recording: Recording) -> list[Finding]:
         found.append(Finding("not_finite", "warning", "t_s", len(bad), (), message))
     with np.errstate(invalid="ignore"):
         steps = np.diff(t_s)
-        gaps = np.flatnonzero(steps > 1.5 * dt)
+        gaps = np.flatnonzero((steps > 1.5 * dt) & np.isfinite(steps))
         back = np.flatnonzero(steps < -0.5 * dt)
         doubled = np.flatnonzero((steps >= -0.5 * dt) & (steps < 0.5 * dt))
     if len(gaps):
@@ -158,7 +162,7 @@ def _time_base(recording: Recording) -> list[Finding]:
         )
         found.append(Finding("unit", "warning", "t_s", len(t_s), (), message))
     regular = steps[np.isfinite(steps) & (steps >= 0.5 * dt) & (steps <= 1.5 * dt)]
-    jitter = float(np.std(regular) / dt) if len(regular) else 0.0
+    jitter = float(np.std(regular / dt)) if len(regular) else 0.0
     if jitter > 0.02:
         message = f"sample times jitter by {100 * jitter:.1f} % of {dt:g} s (one standard deviation): a software clock?"
         found.append(Finding("jitter", "warning", "t_s", len(regular), (), message))
@@ -262,6 +266,38 @@ def _repeats(recording: Recording) -> list[Finding]:
     return [Finding("doubled", "warning", "", len(where), _places(recording, where), message)]
 
 
+def _line(recording: Recording) -> list[Finding]:
+    if not on_a_line(recording.u_V, recording.y_um):
+        return []
+    message = (
+        "y_um: a straight line of u_V within the digits of both: a target, or a copy of the voltage, expected the "
+        "sensor's reading: choose its column (--column y=...)"
+    )
+    return [Finding("line", "refusal", "y_um", len(recording), (), message)]
+
+
+def on_a_line(u: FloatArray, y: FloatArray) -> bool:
+    """Whether ``y`` (n,) is a straight line of ``u`` (n,) within the smallest steps of both: no sensor's reading."""
+    u, y = _centred(u, y)
+    if not u.size or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
+        return False
+    gain = float(np.sum(u * y) / np.sum(u**2))
+    steps = [np.diff(np.unique(np.round(x, 12))) for x in (gain * u, y)]
+    digits = sum(float(np.min(step, initial=1.0)) for step in steps)
+    return float(np.max(np.abs(y - gain * u))) <= digits + ROUND_OFF
+
+
+def _centred(u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both (m,) where both are finite, without their means and over their ranges."""
+    good = np.isfinite(u) & np.isfinite(y)
+    if not good.any():
+        return np.empty(0), np.empty(0)
+    # A span below the smallest normal number is none.
+    least = float(np.finfo(np.float64).tiny)
+    over = [np.asarray(x[good], dtype=np.float64) / max(float(np.ptp(x[good])), least) for x in (u, y)]
+    return over[0] - np.mean(over[0]), over[1] - np.mean(over[1])
+
+
 def _swap(recording: Recording) -> list[Finding]:
     verdict = swapped(recording.u_V, recording.y_um)
     if verdict == "no":
@@ -278,16 +314,17 @@ def _swap(recording: Recording) -> list[Finding]:
 def lead(u: FloatArray, y: FloatArray) -> float:
     """Mean sine of the angle by which ``y`` leads ``u``, (n,) each; negative where y lags, as in a passive stage.
 
-    It is the correlation of y with the slope of u, without the sign of the gain: the signed area of the loops. Samples
-    that are not finite are left out.
+    It is the signed area of the path, closed from its end to its start, over that of a loop without damping, without
+    the sign of the gain. Exchanged columns have the same lead with the other sign. Samples that are not finite are left
+    out.
     """
-    good = np.isfinite(u) & np.isfinite(y)
-    u, y = u[good] - np.mean(u[good]), y[good] - np.mean(y[good])
-    slope = 0.5 * (u[2:] - u[:-2])
-    centre = y[1:-1]
-    size = float(np.sqrt(np.sum(slope**2) * np.sum(centre**2)))
-    gain = float(np.sum(u * y))
-    return float(np.sum(slope * centre)) / size * float(np.sign(gain)) if size > 0.0 else 0.0
+    u, y = _centred(u, y)
+    area = 0.5 * float(np.sum((np.roll(u, -1) - np.roll(u, 1)) * y))
+    # The noise of a sensor adds to its slope: the smoother of the two counts.
+    size = float(
+        min(np.linalg.norm(u[2:] - u[:-2]) * np.linalg.norm(y), np.linalg.norm(y[2:] - y[:-2]) * np.linalg.norm(u))
+    )
+    return 2.0 * area / size * float(np.sign(np.sum(u * y))) if size > 0.0 else 0.0
 
 
 def roughness(x: FloatArray) -> float:
@@ -313,12 +350,12 @@ def _rests_under_noise(u: FloatArray, y: FloatArray) -> bool:
 
 def swapped(u: FloatArray, y: FloatArray) -> Literal["no", "likely", "certain"]:
     """Whether ``u`` and ``y`` look exchanged: a displacement cannot lead its voltage, and only a sensor is noisy."""
-    good = np.isfinite(u) & np.isfinite(y)
-    if np.count_nonzero(good) < 3 or np.ptp(u[good]) == 0.0 or np.ptp(y[good]) == 0.0:
+    good_u, good_y = _centred(u, y)
+    if good_u.size < 3 or np.ptp(good_u) == 0.0 or np.ptp(good_y) == 0.0:
         return "no"
-    if abs(float(np.corrcoef(u[good], y[good])[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
+    if abs(float(np.corrcoef(good_u, good_y)[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
         return "no"
-    if _rests_under_noise(u[good], y[good]):
+    if _rests_under_noise(good_u, good_y):
         # Beside a recorder whose clock runs fast, readings come before their steps.
         return "no"
     return "certain" if roughness(u) > 3.0 * roughness(y) else "likely"

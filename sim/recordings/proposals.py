@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,17 +15,17 @@ from numpy.typing import NDArray
 from sim.recordings.columns import (
     QUANTITIES,
     TIME_WORDS,
+    may_be,
+    named_column,
     other_unit_of_name,
-    proposed_column,
     stated_unit,
     unit_of_name,
 )
+from sim.recordings.findings import on_a_line, swapped
 from sim.recordings.table import Table
 
 #: An array of two dimensions may be columns where one dimension is at most so long and the other so many times longer.
 _MOST_COLUMNS, _TIMES_LONGER = 16, 10
-#: Rates of samples that are likely, Hz: by them a unit of time is proposed.
-_LIKELY_RATES_HZ: Final = (5.0, 5e6)
 _LOOKED_AT: Final = 100_000
 
 
@@ -73,43 +75,45 @@ def likely_time(table: Table) -> Candidate | None:
         or one.name.casefold() in TIME_WORDS
         or _unit(table, "t", one.name) in QUANTITIES["t"][1]
     ]
-    named = proposed_column("t", [one.name for one in found if not one.index], ())
+    named = named_column("t", [one.name for one in found if not one.index])
     if named is not None:
         return next(one for one in found if one.name == named)
     in_time = [one for one in found if not one.index and _unit(table, "t", one.name) in QUANTITIES["t"][1]]
-    rising = [one for one in found if bool(np.all(np.diff(one.values[:_LOOKED_AT].astype(np.float64)) > 0.0))]
+    rising = [one for one in found if _rises(one.values)]
     return next((some[0] for some in (in_time, rising) if len(some) == 1), None)
 
 
-def likely(quantity: str, table: Table, taken: Collection[tuple[str, str]]) -> Candidate | None:
-    """The array to propose for a quantity other than the time; ``taken``: name and index of those of others."""
-    time = likely_time(table)
-    free = [one for one in candidates(table) if (one.name, one.index) not in taken and (one.name, "") not in taken]
-    clock = (time.name, time.index) if time else None
-    free = [one for one in free if (one.name, one.index) != clock and not _counts(one.values)]
-    if not free:
-        return None
-    factors = QUANTITIES[quantity][1]
-    units = {one.name: _unit(table, quantity, one.name) for one in free}
-    fitting = [one for one in free if units[one.name] in factors]
-    if not fitting and quantity == "u":  # a displacement drives nothing
-        fitting = [one for one in free if units[one.name] is None]
-    free = fitting or free
-    name = proposed_column(quantity, [one.name for one in free], ())
-    return next((one for one in free if one.name == name), free[0])
+def likely(
+    quantity: str, table: Table, taken: Collection[tuple[str, str]], drive: NDArray[Any] | None = None
+) -> Candidate | None:
+    """The array to propose for a quantity other than the time; None where none may be it.
+
+    ``taken`` : name and index of those of others. ``drive`` : (n,) the voltage, where it is known; a line of it is no
+    reading. Of arrays whose names say nothing, one that lags another is not the voltage.
+    """
+    units = {name: _unit(table, quantity, name) for name in table.arrays}
+    free = [
+        one
+        for one in candidates(table)
+        if (one.name, one.index) not in taken
+        and (one.name, "") not in taken
+        and may_be(quantity, one.name, units[one.name])
+        # What rises with every sample is a clock.
+        and not _rises(one.values)
+        and not (drive is not None and len(drive) == len(one.values) and on_a_line(drive, one.values))
+    ]
+    free = [one for one in free if units[one.name] in QUANTITIES[quantity][1]] or free
+    name = named_column(quantity, [one.name for one in free])
+    if name is not None:
+        return next(one for one in free if one.name == name)
+    if quantity == "u" and len(free) > 1 and exchanged(free[0].values, free[1].values):
+        return free[1]
+    return free[0] if free else None
 
 
-def likely_time_unit(values: NDArray[Any]) -> str:
-    """The unit that gives a time (n,) a likely rate: ``s``, ``ms``, ``us`` or ``ns``."""
-    if values.ndim != 1 or values.dtype.kind not in "fiu":
-        return "s"
-    steps = np.diff(values[:_LOOKED_AT].astype(np.float64))
-    steps = steps[steps > 0.0]
-    least, most = _LIKELY_RATES_HZ
-    for unit in ("s", "ms", "us", "ns"):
-        if len(steps) and least <= 1.0 / (float(np.median(steps)) * QUANTITIES["t"][1][unit]) <= most:
-            return unit
-    return "s"
+def exchanged(u: NDArray[Any], y: NDArray[Any]) -> bool:
+    """Whether ``u`` (n,) and ``y`` (n,) look exchanged; False where they cannot be compared."""
+    return len(u) == len(y) and swapped(u.astype(np.float64), y.astype(np.float64)) != "no"
 
 
 def _unit(table: Table, quantity: str, name: str) -> str | None:
@@ -120,23 +124,50 @@ def _unit(table: Table, quantity: str, name: str) -> str | None:
     return unit_of_name(quantity, name) or other_unit_of_name(quantity, name)
 
 
-def in_another_file(quantity: str, table: Table) -> tuple[str, ...]:
-    """The options for a quantity that no array of ``table`` can be: instruments write a file for each channel."""
-    file, time = f"--file {quantity}=FILE", likely_time(table)
-    others = [one.name for one in candidates(table) if time is None or one.name != time.name]
-    if quantity != "y" or len(others) != 1:
-        return (file,)
-    unit = _unit(table, "u", others[0])
+def only_signal(table: Table) -> Candidate | None:
+    """The only array of a table beside its time."""
+    time = likely_time(table)
+    signals = [one for one in candidates(table) if time is None or one.name != time.name]
+    return signals[0] if len(signals) == 1 else None
+
+
+def in_another_file(quantity: str, table: Table, other: Path | None, drives: bool) -> tuple[str, ...]:
+    """The options for a quantity that no array of ``table`` can be: instruments write a file for each channel.
+
+    ``other`` : the file of the other channel, where it is known; ``drives`` : whether it is the voltage's.
+    """
+    one = only_signal(table)
+    if quantity != "y" or one is None:
+        return (f"--file {quantity}=FILE",)
+    file = "FILE" if other is None else shlex.quote(str(other))
+    unit = _unit(table, "y", one.name)
     # The sensor's file is like that of the voltage: with a unit in volts, or without any.
-    if unit is None:
-        return (file, "--unit y=um")
-    return (file, "--scale y=FACTOR") if unit in QUANTITIES["u"][1] else (file,)
+    asked = () if unit in QUANTITIES["y"][1] else ("--unit y=UNIT",) if unit is None else ("--scale y=FACTOR",)
+    return (f"--file {'u' if drives else 'y'}={file}", *asked)
+
+
+#: The number of a channel in the name of a file: ``C1--stage``, ``F0001CH1``, ``tek_chan2``.
+_CHANNEL: Final = re.compile(r"(?<![A-Za-z])(ch|chan|channel|c)([ _-]?)(\d+)(?![\dA-Za-z])", re.IGNORECASE)
+
+
+def other_channel(path: Path) -> Path | None:
+    """The only file beside ``path`` that has its name but for the number of the channel; None where there is none."""
+    if len(_CHANNEL.findall(path.name)) != 1:
+        return None
+    plain = _CHANNEL.sub(r"\1\2", path.name)
+    beside = [file for file in path.parent.glob(f"*{path.suffix}") if file != path]
+    found = [file for file in beside if _CHANNEL.sub(r"\1\2", file.name) == plain]
+    return found[0] if len(found) == 1 else None
 
 
 def _changes(values: NDArray[Any]) -> bool:
     some = values[:_LOOKED_AT].astype(np.float64)
     some = some[np.isfinite(some)]
     return bool(some.size) and float(np.ptp(some)) > 0.0
+
+
+def _rises(values: NDArray[Any]) -> bool:
+    return bool(np.all(np.diff(values[:_LOOKED_AT].astype(np.float64)) > 0.0))
 
 
 def _counts(values: NDArray[Any]) -> bool:

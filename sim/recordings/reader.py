@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import hashlib
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.recordings import array_formats as arrays
-from sim.recordings import delimited_text
+from sim.recordings import delimited_text, json_arrays
 from sim.recordings import text_formats as text
 from sim.recordings.columns import (
     KELVIN_AT_0_C,
@@ -25,7 +28,15 @@ from sim.recordings.columns import (
     default_column,
     factor_and_unit,
 )
-from sim.recordings.proposals import Candidate, in_another_file, likely, likely_time, likely_time_unit
+from sim.recordings.proposals import (
+    Candidate,
+    exchanged,
+    in_another_file,
+    likely,
+    likely_time,
+    only_signal,
+    other_channel,
+)
 from sim.recordings.recording import Recording
 from sim.recordings.table import MAX_BYTES, Table
 
@@ -86,26 +97,32 @@ _MOST_TEXT_BYTES = 4 * MAX_BYTES
 def _head(path: Path, digest: Any) -> bytes:
     """The beginning of a file; ``digest`` takes all of it, in pieces. Raises InputError."""
     try:
-        size = path.stat().st_size
-        if size > _MOST_TEXT_BYTES:
-            most = _MOST_TEXT_BYTES / 1e9
-            raise InputError(f"{path}: got {size / 1e9:.1f} GB, expected at most {most:g} GB: cut it first")
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-            digest.update(head)
             while piece := file.read(1 << 22):
                 digest.update(piece)
+        size, head = 0, b""
+        with text.opened_bytes(path) as file:
+            while size <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
+                head = head or piece[:_HEAD_BYTES]
+                size += len(piece)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise InputError(f"{path}: is not a whole gzip file ({error}), expected one: pack it again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a recording") from error
+    if size > _MOST_TEXT_BYTES:
+        most = _MOST_TEXT_BYTES / 1e9
+        raise InputError(f"{path}: got more than {most:g} GB, expected at most that: cut it first")
     if not head:
         raise InputError(f"{path}: got an empty file, expected a recording")
     return head
 
 
 def _content(path: Path) -> bytes:
-    if (size := path.stat().st_size) > MAX_BYTES:
-        raise InputError(f"{path}: got {size / 1e9:.1f} GB, expected at most {MAX_BYTES / 1e9:g} GB: cut it first")
-    return path.read_bytes()
+    with text.opened_bytes(path) as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{path}: got more than {MAX_BYTES / 1e9:g} GB, expected at most that: cut it first")
+    return content
 
 
 _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
@@ -119,6 +136,8 @@ _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
     ".tdms": arrays.read_tdms,
     ".feather": arrays.read_feather,
     ".arrow": arrays.read_feather,
+    ".json": json_arrays.read_json,
+    ".jsonl": json_arrays.read_json,
 }
 #: First bytes of a file -> its reader, for files with another ending.
 _BY_FIRST_BYTES: dict[bytes, Callable[[Path, bytes], Table]] = {
@@ -134,13 +153,10 @@ _REFUSED = {
     ".xls": "an old Excel workbook, expected .xlsx or .csv: save it as one of these",
     ".tdms_index": "the index of a TDMS file, expected the .tdms file beside it",
     ".ods": "an OpenDocument sheet, expected .xlsx or .csv: save it as one of these",
-    ".json": "JSON, expected a table: save it as .csv or .npz",
-    ".jsonl": "JSON, expected a table: save it as .csv or .npz",
     ".pkl": "a pickled Python object, which is never loaded: save its arrays as .npz or .csv",
 }
 #: First bytes of files that are no recordings, with what they are and what to do.
 _REFUSED_BY_FIRST_BYTES: dict[bytes, str] = {
-    b"\x1f\x8b": "a file packed by gzip: unpack it first (gunzip)",
     b"PK\x03\x04": "a packed folder (zip): unpack it first",
     b"%PDF": "a PDF, expected the samples themselves: export them as .csv",
     b"\xd0\xcf\x11\xe0": "an old Office file, expected .xlsx or .csv: save it as one of these",
@@ -153,10 +169,16 @@ _REFUSED_BY_FIRST_BYTES: dict[bytes, str] = {
 
 
 def _table(path: Path, digest: Any, mapping: ColumnMap) -> Table:
-    ending = path.suffix.lower()
+    ending = (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
     if ending in _REFUSED:
         raise InputError(f"{path}: is {_REFUSED[ending]}")
-    head = _head(path, digest)
+    table = _read_as(path, ending, _head(path, digest), mapping)
+    if not table.arrays:
+        raise InputError(f"{path}: holds no arrays of numbers, but {table.describe()}; expected one value per sample")
+    return table
+
+
+def _read_as(path: Path, ending: str, head: bytes, mapping: ColumnMap) -> Table:
     if ending in _BY_ENDING:
         return _BY_ENDING[ending](path, _content(path))
     if ending in (".xlsx", ".xlsm") or (head.startswith(b"PK\x03\x04") and b"[Content_Types].xml" in head):
@@ -198,8 +220,8 @@ class _Reading:
         self.notes = [note for table in self.tables for note in table.notes]
         #: quantity -> name of its array in its table, for the columns that were read.
         self.names: dict[str, str] = {}
-        #: Name and index of arrays that were proposed for quantities whose column is unknown.
-        self._proposals: set[tuple[str, str]] = set()
+        #: Arrays that were proposed for quantities whose column is unknown.
+        self._proposals: dict[str, Candidate] = {}
 
     def recording(self, source: str, sha256: str) -> Recording:
         """The columns under their names, all of one length. Raises InputError; MissingError with all that is
@@ -271,17 +293,38 @@ class _Reading:
         read = [name for q, name in self.names.items() if self.by_quantity.get(q, self.main) is table]
         return [*read, *self._said_in(table)]
 
-    def _proposed(self, quantity: str, table: Table, otherwise: tuple[str, ...]) -> tuple[str, ...]:
-        """The options to add for a quantity whose column is unknown; ``otherwise`` where none can be it."""
-        taken = {(name, "") for name in self._taken(table)} | self._proposals
-        time = likely_time(table)
-        one = time if quantity == "t" and time and (time.name, time.index) not in taken else None
-        if quantity != "t":
-            one = likely(quantity, table, taken)
+    def _proposed(self, quantity: str, table: Table) -> tuple[str, ...]:
+        """The options to add for a quantity whose column is unknown."""
+        taken = {(name, "") for name in self._taken(table)} | {(p.name, p.index) for p in self._proposals.values()}
+        if quantity == "t":
+            time = likely_time(table)
+            one = time if time and (time.name, time.index) not in taken else None
+        else:
+            one = likely(quantity, table, taken, self._drive(table) if quantity == "y" else None)
         if one is None:
-            return otherwise
-        self._proposals.add((one.name, one.index))
+            return ("--rate HZ",) if quantity == "t" else self._elsewhere(quantity, table)
+        self._proposals[quantity] = one
         return self._with_unit(quantity, one, table)
+
+    def _drive(self, table: Table) -> NDArray[Any] | None:
+        """The voltage (n,) as far as it is known or proposed, in the file's numbers."""
+        if "u" in self._proposals:
+            return self._proposals["u"].values
+        if "u" not in self.names or self.by_quantity.get("u", self.main) is not table:
+            return None
+        return table.column("u", self.names["u"], self.mapping.index.get("u"))[0]
+
+    def _elsewhere(self, quantity: str, table: Table) -> tuple[str, ...]:
+        """The options for a quantity in another file: that of the other channel, where there is one."""
+        path = Path(table.source)
+        other, mine = other_channel(path) if path.is_file() else None, only_signal(table)
+        theirs = None
+        if quantity == "y" and other is not None and mine is not None:
+            with contextlib.suppress(InputError):
+                theirs = only_signal(_table(other, hashlib.sha256(), self.mapping))
+        if theirs is None or mine is None:
+            return in_another_file(quantity, table, None, False)
+        return in_another_file(quantity, table, other, exchanged(mine.values, theirs.values))
 
     def _with_unit(self, quantity: str, one: Candidate, table: Table) -> tuple[str, ...]:
         """The options that make an array a quantity."""
@@ -289,7 +332,7 @@ class _Reading:
         try:
             factor_and_unit(table.source, quantity, one.name, self.mapping, table.units.get(one.name))
         except MissingError as error:
-            return (*chosen, *_with_time_unit(quantity, error.options, one.values))
+            return (*chosen, *error.options)
         except InputError:  # in a unit of another kind: a sensor's volts
             return (*chosen, f"--scale {quantity}=FACTOR")
         return chosen
@@ -321,17 +364,13 @@ class _Reading:
                 f"in another file, --file {quantity}=FILE",
                 f"which column is {canonical}, {WORDS.get(quantity, quantity)} (--column {quantity}={way}), and "
                 f"its unit ({', '.join(factors)}); if it is in another file, --file {quantity}=FILE",
-                *self._proposed(quantity, table, in_another_file(quantity, table)),
+                *self._proposed(quantity, table),
             )
         self.names[quantity] = name
         return self._values(quantity, table, name)
 
     def _values(self, quantity: str, table: Table, name: str) -> FloatArray:
-        try:
-            factor, unit = factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
-        except MissingError as error:
-            options = _with_time_unit(quantity, error.options, table.array(quantity, name))
-            raise MissingError(str(error), error.what, *options) from error
+        factor, unit = factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
         values, done = table.column(quantity, name, self.mapping.index.get(quantity))
         if done:
             self.notes.append(done)
@@ -380,7 +419,7 @@ class _Reading:
                 "--column t=NAME --unit t=..., or the sample time as --dt-s SECONDS or the rate as --rate HZ, or "
                 "--column rate=NAME where the file holds a rate",
                 "the time: which column it is and its unit, or the rate as --rate HZ",
-                *self._proposed("t", self.main, ("--rate HZ",)),
+                *self._proposed("t", self.main),
             )
         return np.arange(n, dtype=np.float64) * dt_s, float(dt_s)
 
@@ -490,13 +529,6 @@ class _Reading:
 
 #: What the quantities are that every recording has, for people.
 WORDS = {"t": "the time", "u": "the voltage", "y": "the displacement"}
-
-
-def _with_time_unit(quantity: str, options: tuple[str, ...], values: NDArray[Any]) -> tuple[str, ...]:
-    """``options`` with the unit that gives a time (n,) a likely rate."""
-    if quantity != "t":
-        return options
-    return tuple(f"--unit t={likely_time_unit(values)}" if o.startswith("--unit t=") else o for o in options)
 
 
 def _all_missing(source: str, held: str, missing: list[MissingError]) -> MissingError:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gzip
+import io
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +52,11 @@ def different(names: list[str]) -> list[str]:
 
 
 def units_row(names: list[str], cells: list[str]) -> dict[str, str]:
-    """name -> unit from the row below the names; empty unless every cell is a unit, or empty, and one is a unit."""
+    """name -> unit from the row below the names; empty unless most cells are units, or empty, and the rest texts."""
     bare = [cell.strip("[]() ") for cell in cells]
-    if len(bare) != len(names) or not all(is_unit(cell) for cell in bare if cell):
+    filled = [cell for cell in bare if cell]
+    known = sum(map(is_unit, filled))
+    if len(bare) != len(names) or 2 * known <= len(filled) or any(is_number(cell, ".") for cell in filled):
         return {}
     return {name: cell for name, cell in zip(names, bare, strict=True) if cell}
 
@@ -70,6 +74,22 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     else:
         cells = line.split() if delimiter == " " else line.split(delimiter)
     return [cell.strip().strip('"') for cell in cells]
+
+
+def is_packed(path: Path) -> bool:
+    """Whether a file begins as one packed by gzip."""
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def opened_bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
+    """The bytes of a file, unpacked where gzip has packed it."""
+    return gzip.open(path) if is_packed(path) else path.open("rb")
+
+
+def opened(path: Path, encoding: str) -> TextIO:
+    """A file of text, unpacked where gzip has packed it."""
+    return io.TextIOWrapper(opened_bytes(path), encoding=encoding, newline=None)
 
 
 def encoding_of(path: Path, head: bytes) -> str:

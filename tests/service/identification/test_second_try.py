@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import gzip
+import json
+import os
 import shlex
 from collections.abc import Callable
 from datetime import datetime, timedelta
@@ -25,7 +28,8 @@ from sim.recordings.columns import ColumnMap, MissingError, unit_of_name
 N, DT_S = 3000, 1e-3
 T_S = np.arange(N) * DT_S
 U_V = 5.0 - 4.5 * np.cos(2 * np.pi * 1.3 * T_S)
-Y_UM = 8.0 * U_V + 1.5 * np.sin(2 * np.pi * 1.3 * T_S) + 3.0
+# The displacement lags the voltage, as in a stage.
+Y_UM = 8.0 * U_V - 1.5 * np.sin(2 * np.pi * 1.3 * T_S) + 3.0
 RECORDS = np.zeros(N, dtype=[("time", "f8"), ("voltage_V", "f8"), ("pos_nm", "f8")])
 RECORDS["time"], RECORDS["voltage_V"], RECORDS["pos_nm"] = T_S, U_V, 1e3 * Y_UM
 
@@ -36,7 +40,7 @@ def second_try(path: Path, filled: dict[str, str] | None = None) -> tuple[Record
         return read(path), 1
     except MissingError as error:
         options = shlex.split(" ".join(error.options))
-    for word, value in (filled or {}).items():
+    for word, value in {"u=UNIT": "u=V", "y=UNIT": "y=um", "t=UNIT": "t=s", **(filled or {})}.items():
         options = [
             f"{option.removesuffix(word)}{value}" if option.endswith(f"={word}") or option == word else option
             for option in options
@@ -57,10 +61,10 @@ def rows(line: str) -> str:
     start = datetime(2026, 11, 25, 14, 3, 11)
     return "".join(
         line.format(
-            k=k, t=t, u=u, y=y, v=y / 10, ms=1e3 * t,
+            k=k, k3=(k % 777) / 9, t=t, u=u, y=y, v=y / 10, ms=1e3 * t,
             iso=(start + timedelta(milliseconds=k)).isoformat("T", "milliseconds"),
             clock=(start + timedelta(milliseconds=k)).strftime("%d.%m.%Y %H:%M:%S.%f"),
-            day=f"11/25/2026 14:00:{int(t):02d}", rest=k % 1000, u_mV=1e3 * u, y_nm=1e3 * y,
+            days=46_000.5 + t / 86_400, day=f"11/25/2026 14:00:{int(t):02d}", rest=k % 1000, u_mV=1e3 * u, y_nm=1e3 * y,
         )
         for k, (t, u, y) in enumerate(zip(T_S.tolist(), U_V.tolist(), Y_UM.tolist(), strict=True))
     )  # fmt: skip
@@ -197,7 +201,7 @@ SCOPES: dict[str, tuple[str, str, dict[str, str]]] = {
     "LabVIEW's waveforms": (LABVIEW, commas("{clock}\t{u:.6f}\t{y:.6f}\n").replace(":,", ":."), {}),
     "BenchLink": (BENCHLINK, "{k},{day}:{rest:03d},{u:.5E},0,{v:.6E},0\n", {"FACTOR": "10"}),
     "a counter in place of a time": ("Sample,U (V),Y (um)\n", "{k},{u:.5f},{y:.5f}\n", {"HZ": "1000"}),
-    "a time in ms without a unit": ("Time,Drive (V),Sensor (um)\n", "{ms:.1f},{u:.5f},{y:.5f}\n", {}),
+    "a time in ms without a unit": ("Time,Drive (V),Sensor (um)\n", "{ms:.1f},{u:.5f},{y:.5f}\n", {"t=UNIT": "t=ms"}),
     "an alarm beside each channel": ("Time (s),A,Alarm,B\n", "{t:.3f},{u:.5f},0,{y:.5f}\n", {}),
 }  # fmt: skip
 
@@ -391,12 +395,15 @@ def test_a_sheet_of_dates_and_numbers_in_one_column_is_refused(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", b"\x1f\x8b\x08" + bytes(100), r"packed by gzip: unpack it first"),
+        ("a.csv.gz", gzip.compress(b"t_s,u_V,y_um\n" * 999)[:-9], "is not a whole gzip file"),
+        ("a.csv", b"\x1f\x8b\x08" + bytes(100), "is not a whole gzip file"),
         ("a.csv", b"%PDF-1.4\n" + bytes(100), "is a PDF"),
         ("a.csv", b"<!DOCTYPE html><html></html>\n", "is a web page"),
         ("a.csv", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(100), "an old Office file"),
         ("a.isf", b":WFMPRE:BYT_NR 2;:CURVE #46000" + bytes(100), "own waveform file: export it as .csv"),
-        ("a.json", b'{"t_s": [0.0, 1.0]}', "is JSON, expected a table: save it as"),
+        ("a.json", b'{"t_s": [0.0, 1.0', "is not whole JSON"),
+        ("a.json", b"[" * 100_000, "is not whole JSON"),
+        ("a.json", b'{"stage": "7", "date": [2026, [11], "x"]}', "holds no arrays of numbers"),
     ],
 )
 def test_a_refused_file_is_called_what_it_is(tmp_path: Path, name: str, content: bytes, message: str) -> None:
@@ -416,3 +423,148 @@ def test_a_unit_of_another_kind_asks_for_a_factor_and_an_option_overrides_it(tmp
 @pytest.mark.parametrize("name", ["Axis 1", "drive", "signal-to-noise", "V", "in", "run/7"])
 def test_names_without_a_unit_have_none(name: str) -> None:
     assert unit_of_name("u", name) is None
+
+
+#: Columns of which some were proposed wrongly, a line of them, and the names of the voltage's and the sensor's.
+PROPOSED: dict[str, tuple[str, str, tuple[str, str]]] = {
+    "a target": (
+        "Target Position,Control Voltage,Current Position\n", "{k3:.3f},{u:.5f},{y:.5f}\n",
+        ("Control Voltage", "Current Position"),
+    ),
+    "a unit of another kind": ("t (s),U (V),Tilt (mrad)\n", "{t:.3f},{u:.5f},{v:.6f}\n", ("", "Tilt (mrad)")),
+    "counts": ("t (s),dac_counts,adc_counts\n", "{t:.3f},{u:.5f},{v:.6f}\n", ("dac_counts", "adc_counts")),
+    "a displacement alone": ("x [s],y [m]\n", "{t:.3f},{v:.6f}\n", ("", "")),
+    "a time with another name": ("Tout,A,B\n", "{t:.3f},{u:.5f},{y:.5f}\n", ("A", "B")),
+    "a date of a spreadsheet": ("When,Drive date,A,B\n", "{t:.3f},{days:.9f},{u:.5f},{y:.5f}\n", ("A", "B")),
+    "the sensor first": ("Time (s),A,B\n", "{t:.3f},{y:.5f},{u:.5f}\n", ("B", "A")),
+    "a copy of the voltage": ("Time (s),A,B,C\n", "{t:.3f},{u:.5f},{u:.4f},{y:.5f}\n", ("A", "C")),
+    "a temperature": ("t (s),A,T (degC),B\n", "{t:.3f},{u:.5f},{v:.4f},{y:.5f}\n", ("A", "B")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROPOSED)
+def test_no_proposal_is_wrong(tmp_path: Path, name: str) -> None:
+    head, line, expected = PROPOSED[name]
+    (tmp_path / "a.csv").write_text(head + rows(line))
+    with pytest.raises(MissingError) as caught:
+        read(tmp_path / "a.csv")
+    options = [tuple(shlex.split(option)) for option in caught.value.options]
+    columns = dict(value.split("=") for option, value in options if option == "--column")
+    assert (columns.get("u", ""), columns.get("y", "")) == expected
+    # A unit that is written nowhere is asked for, and one of another kind needs a factor.
+    units = [value for option, value in options if option in ("--unit", "--scale")]
+    assert all(value.endswith(("=UNIT", "=FACTOR")) for value in units)
+    assert ("y=FACTOR" in units) == (name in ("counts", "a unit of another kind"))
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("names", [("C1--stage--0.csv", "C2--stage--0.csv"), ("F0001CH1.csv", "F0001CH2.csv")])
+def test_the_other_channels_file_is_proposed(tmp_path: Path, names: tuple[str, str], first: int) -> None:
+    (tmp_path / names[0]).write_text("Time,Ampl\n" + rows("{t:.6e},{u:.5f}\n"))
+    (tmp_path / names[1]).write_text("Time,Ampl\n" + rows("{t:.6e},{y:.5f}\n"))
+    recording, tries = second_try(tmp_path / names[first])
+    assert tries == 2
+    assert_read(recording)
+
+
+def test_no_file_is_proposed_where_there_are_several_channels(tmp_path: Path) -> None:
+    for k in (1, 2, 3):
+        (tmp_path / f"C{k}.csv").write_text("Time,Ampl\n" + rows("{t:.6e},{u:.5f}\n"))
+    with pytest.raises(MissingError) as caught:
+        read(tmp_path / "C1.csv")
+    assert "--file y=FILE" in caught.value.options
+
+
+def test_a_packed_text_and_a_packed_binary_file(tmp_path: Path) -> None:
+    with gzip.open(tmp_path / "a.csv.gz", "wt") as file:
+        file.write("t_s,u_V,y_um\n" + rows("{t:.3f},{u:.5f},{y:.5f}\n"))
+    assert_read(read(tmp_path / "a.csv.gz"))
+    np.savez(tmp_path / "a.npz", t_s=T_S, u_V=U_V, y_um=Y_UM)
+    (tmp_path / "b.npz.gz").write_bytes(gzip.compress((tmp_path / "a.npz").read_bytes()))
+    assert_read(read(tmp_path / "b.npz.gz"))
+
+
+def archived(name: str, unit: str, values: Any) -> dict[str, Any]:
+    stamps = [{"secs": 1_764_300_000 + k // 1000, "nanos": k % 1000 * 1_000_000} for k in range(N)]
+    return {"meta": {"name": name, "EGU": unit}, "data": [{**s, "val": v} for s, v in zip(stamps, values, strict=True)]}
+
+
+JSON: dict[str, Any] = {
+    "arrays": {"t_s": T_S.tolist(), "u_V": U_V.tolist(), "y_um": Y_UM.tolist(), "stage": "7"},
+    "arrays with units": {
+        "rate": {"value": 1},
+        "time": {"unit": "ms", "values": (1e3 * T_S).tolist()},
+        "drive": {"units": "V", "values": U_V.tolist()},
+        "sensor": {"unit": "nm", "values": (1e3 * Y_UM).tolist()},
+    },
+    "records": [{"t_s": t, "u_V": u, "y_um": y} for t, u, y in TABLE],
+    "an archive": [archived("PZ:VOLT", "V", U_V.tolist()), archived("PZ:POS", "um", Y_UM.tolist())],
+}
+
+
+@pytest.mark.parametrize("name", JSON)
+def test_json_of_arrays(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(JSON[name]))
+    assert_read(read(tmp_path / "a.json"))
+
+
+def test_json_of_a_record_a_line_with_a_missing_value(tmp_path: Path) -> None:
+    records_of = [dict(record) for record in JSON["records"]]
+    records_of[7]["y_um"] = None
+    (tmp_path / "a.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records_of))
+    assert np.flatnonzero(np.isnan(read(tmp_path / "a.jsonl").y_um)).tolist() == [7]
+
+
+def test_thousands_that_begin_late_and_repeat(tmp_path: Path) -> None:
+    body = "".join(
+        f"{1e6 * t:,.0f};{1e3 * u:,.2f};{1e3 * y:,.1f}\n" for t, u, y in zip(T_S, U_V, Y_UM, strict=True)
+    ).translate(str.maketrans(",.", ".,"))
+    (tmp_path / "a.csv").write_text("Zeit [us];Spannung [mV];Weg [nm]\n" + body)
+    assert_read(read(tmp_path / "a.csv"))
+    late = "".join(f"{k:,};{u:.5f};{y:.5f}\n" for k, (u, y) in enumerate(zip(U_V, Y_UM, strict=True)))
+    (tmp_path / "b.csv").write_text("Zeit [ms];U [V];Weg [um]\n" + late.translate(str.maketrans(",.", ".,")))
+    assert_read(read(tmp_path / "b.csv"))
+
+
+def test_a_row_of_units_with_one_of_another_kind_names_no_columns(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Time,Voltage,Position,R\ns,V,um,kOhm\n" + rows("{t:.3f},{u:.5f},{y:.5f},{k}\n"))
+    assert_read(read(tmp_path / "a.csv"))
+
+
+def test_a_file_without_arrays_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    def build(file: h5py.File) -> None:
+        stored = file.create_dataset("TT", data=np.zeros((1, 6), dtype=np.uint32))
+        stored.attrs["MATLAB_class"] = np.bytes_("timetable")
+
+    write_v73(tmp_path / "a.mat", build)
+    with pytest.raises(InputError, match=r"no arrays of numbers.*TT \(a timetable: save its columns as arrays"):
+        read(tmp_path / "a.mat")
+
+
+AWKWARD = Path(os.environ.get("DEHYST_DATA", "../shared/data")) / "awkward"
+#: File -> tries, and what the user fills in.
+EXPORTS: dict[str, tuple[int, dict[str, str]]] = {
+    "03_lecroy_C1--stage--00000.csv": (2, {}),
+    "03_lecroy_C2--stage--00000.csv": (2, {}),
+    "04_tds_F0001CH1.csv": (2, {"FACTOR": "10"}),
+    "04_tds_F0001CH2.csv": (2, {"FACTOR": "10"}),
+    "05_pi_gcs.dat": (2, {}),
+    "07_igor.itx": (2, {"HZ": "1000"}),
+    "10_archiver.json": (1, {}),
+    "17_thousands.csv": (1, {}),
+    "23_counts.csv": (2, {"FACTOR": "0.00152588", "HZ": "1000"}),
+    "25_mrad.csv": (2, {"FACTOR": "40"}),
+}
+
+
+@pytest.mark.skipif(not AWKWARD.is_dir(), reason="needs the folder awkward of DEHYST_DATA")
+@pytest.mark.parametrize("name", EXPORTS)
+def test_awkward_exports(tmp_path: Path, name: str) -> None:
+    most, filled = EXPORTS[name]
+    recording, tries = second_try(AWKWARD / name, filled)
+    assert tries <= most
+    assert recording.dt_s == pytest.approx(DT_S)
+    assert 90.0 < np.ptp(recording.u_V) < 96.0
+    # The sensor's volts, 10 µm each, have no unit in these files.
+    factor = 10.0 if "lecroy" in name else 1.0
+    assert 75.0 < factor * np.ptp(recording.y_um) < 83.0

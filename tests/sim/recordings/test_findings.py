@@ -153,6 +153,18 @@ def test_not_finite() -> None:
         require_usable(ridden, check(ridden))
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("column", ["t_s", "u_V", "y_um", "monitor_V"])
+@pytest.mark.parametrize("values", [np.nan, np.inf, 1e300, 1e-310])
+def test_columns_beyond_arithmetic_give_findings_and_no_warnings(column: str, values: float) -> None:
+    base = replace(healthy(), monitor_V=healthy().u_V)
+    with np.errstate(invalid="ignore"):
+        whole = getattr(base, column) * values
+    found = check(replace(base, **{column: whole}))
+    assert {finding.column for finding in found} & {column, ""}
+    check(replace(base, **{column: np.where(np.arange(len(base)) % 5 == 0, whole, getattr(base, column))}))
+
+
 @pytest.mark.parametrize("column", ["u_V", "y_um"])
 @pytest.mark.parametrize("level", [0.0, 2.5])
 def test_all_zero_and_constant_are_refused(column: str, level: float) -> None:
@@ -175,6 +187,27 @@ def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
         require_usable(exchanged, check(exchanged))
     negative = replace(base, y_um=-base.y_um)
     assert "swapped" not in kinds(negative)
+
+
+def test_exchanged_columns_of_a_recording_that_ends_away_from_its_start_are_refused() -> None:
+    part = healthy().part(0, 250)
+    part = replace(part, u_V=150.0 / np.ptp(part.u_V) * part.u_V)
+    assert abs(part.u_V[-1] - part.u_V[0]) > 0.5 * np.ptp(part.u_V)
+    assert "swapped" not in kinds(part)
+    exchanged = replace(part, u_V=part.y_um, y_um=part.u_V)
+    assert kinds(exchanged)["swapped"] == "refusal"
+    assert lead(part.y_um, part.u_V) == pytest.approx(-lead(part.u_V, part.y_um))
+
+
+def test_a_displacement_that_is_a_line_of_the_voltage_is_refused() -> None:
+    base = healthy()
+    coarse = np.round(base.u_V / 0.003) * 0.003
+    for u_V, y_um in ((base.u_V, 9.0 * base.u_V + 4.0), (coarse, np.round(-8.0 * base.u_V, 4))):
+        target = replace(base, u_V=u_V, y_um=y_um)
+        with pytest.raises(InputError, match=r"y_um: a straight line of u_V.*a target, or a copy.*--column y="):
+            require_usable(target, check(target))
+    counts = replace(base, y_um=np.round(base.y_um / 0.5) * 0.5)
+    assert "line" not in kinds(counts)
 
 
 def test_a_command_that_rests_under_a_noisy_sensor_is_not_exchanged_where_the_clock_lets_readings_lead() -> None:

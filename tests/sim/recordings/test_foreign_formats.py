@@ -301,7 +301,7 @@ def test_files_whose_only_column_needs_no_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"(?s)drive\.csv: got columns 1.*1\. the unit of column '1' for u") as caught:
         read(main, ColumnMap(files={"y": other}, dt_s=DT_S))
     assert isinstance(caught.value, MissingError)
-    assert caught.value.options == ("--unit u=V", "--unit y=um")
+    assert caught.value.options == ("--unit u=UNIT", "--unit y=UNIT")
     # Alone, the file may hold anything.
     with pytest.raises(InputError, match=r"(?s)which column is u_V.*--column u=NAME .*position.*--file u=FILE"):
         read(main, ColumnMap(units=UNITS, dt_s=DT_S))

@@ -118,8 +118,8 @@ def test_all_that_is_missing_in_one_message(tmp_path: Path) -> None:
     with pytest.raises(MissingError, match=r"(?s)Time, Ch A, Ch B.*3 things.*u_V.*y_um.*the time") as caught:
         read(path)
     options = caught.value.options
-    assert options[:2] == ("--column 'u=Ch A'", "--unit u=V")
-    assert options[4:] == ("--column t=Time", "--unit t=s")
+    assert options[:2] == ("--column 'u=Ch A'", "--unit u=UNIT")
+    assert options[4:] == ("--column t=Time", "--unit t=UNIT")
     path.write_text("u_V,y_um\n" + rows(U, Y))
     with pytest.raises(MissingError) as caught:
         read(path)
