@@ -23,7 +23,7 @@ export OMP_NUM_THREADS ?= 1
 # Each of the hundreds of processes that tests start would compile what it imports once more.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup setup-test demo test test-processes test-computing test-clients wheel-check check docs bench foreign \
+.PHONY: help setup setup-test demo test test-processes test-computing test-long test-clients wheel-check check docs bench foreign \
         fuzz blind blind-foreign vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -60,11 +60,14 @@ test: ## lint, types, import contract, and all tests
 	$(BIN)/python -m pytest -m alone $$(grep -rl --include='test_*.py' mark.alone tests)
 
 test-processes: .setup-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not alone" $(PROCESSES)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not alone and not long" $(PROCESSES)
 
 test-computing: .setup-test
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" \
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone and not long" \
 	    $(addprefix --ignore=,$(PROCESSES))
+
+test-long: .setup-test ## whole diagnoses of records of other generators (ten minutes)
+	$(BIN)/python -m pytest -n 2 --dist load -m long tests/sim
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
 	@sh clients/test.sh

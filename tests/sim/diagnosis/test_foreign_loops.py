@@ -166,6 +166,7 @@ def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None
     assert chosen.before_V == 0.0
 
 
+@pytest.mark.long
 def test_a_payload_is_looked_for_where_the_stage_rings() -> None:
     said = diagnose_prepared(prepare(recording_of(LOADED), nominal=nominal_of(LOADED)))
     assert [cause.name for cause in said.causes] == ["payload_change"]
@@ -226,11 +227,13 @@ def test_a_response_behind_a_limit_of_the_speed_shows_no_lag() -> None:
     assert "limit of the speed" in second_lag(readings).words
 
 
+@pytest.mark.long
 def test_slips_that_a_wrong_loop_called_for_are_dropped_beside_a_better_one() -> None:
     said = diagnosed(SLIPPED)
     assert {cause.name for cause in said.causes} == {"timing", "hysteresis_shape"}
 
 
+@pytest.mark.long
 def test_two_lags_are_told_apart_where_the_calibration_found_their_sum() -> None:
     said = diagnosed(TWO_LAGS)
     assert [cause.name for cause in said.causes] == ["sensor_lag"]
@@ -239,6 +242,7 @@ def test_two_lags_are_told_apart_where_the_calibration_found_their_sum() -> None
     assert said.extended_heldout_um < 1.2 * said.noise_floor_um
 
 
+@pytest.mark.long
 def test_a_payload_is_weighed_against_the_stated_frequency() -> None:
     """Calibration may move a stated mode by 1.5 %, which a payload throughout cannot be told from."""
     case = single(796)
@@ -248,6 +252,7 @@ def test_a_payload_is_weighed_against_the_stated_frequency() -> None:
     assert high - low < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [USED_AND_LOADED, USED_AND_CLIPPED], ids=["payload", "saturation_too"])
 def test_the_stage_of_a_file_may_have_moved_before_the_record(case: Case) -> None:
     """Its loop does not begin relaxed then; a loop of another shape would imitate that."""
@@ -256,12 +261,14 @@ def test_the_stage_of_a_file_may_have_moved_before_the_record(case: Case) -> Non
     assert said.extended_heldout_um < 1.25 * max(said.noise_floor_um, case.rig.sigma_um)
 
 
+@pytest.mark.long
 def test_a_finer_shape_is_fitted_again_beside_a_drift_without_which_it_held_out_worse() -> None:
     said = diagnosed(DRIFTING)
     assert {cause.name for cause in said.causes} == {"hysteresis_shape", "thermal_drift"}
     assert said.extended_heldout_um < 0.0015
 
 
+@pytest.mark.long
 def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
     said = diagnosed(CURVED)
     lag_s = dict(zip((s.name for s in said.extended.model.parameters), said.extended.p, strict=True))["tau_s"]
@@ -270,6 +277,7 @@ def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
     assert said.extended_heldout_um < 1.5 * said.noise_floor_um
 
 
+@pytest.mark.long
 def test_one_level_beyond_the_limit_shows_a_saturation() -> None:
     said = diagnosed(ONE_LEVEL)
     assert {"saturation"} <= {c.name for c in said.causes} <= {"saturation", "hysteresis_shape"}
@@ -283,11 +291,13 @@ def test_cycles_over_a_part_of_the_range_do_not_exclude_a_bow() -> None:
     assert mirrored_branches(readings).seen is None
 
 
+@pytest.mark.long
 def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
     said = diagnosed(BOWED)
     assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [WITH_A_BOW, WIDENED, WARMED, CREEPING, SLEWED], ids=lambda case: case.hidden[0])
 def test_what_the_form_of_a_cause_leaves_is_not_another_cause(case: Case) -> None:
     said = diagnosed(case)
@@ -338,6 +348,7 @@ def test_two_lags_are_not_seen_as_a_delay(case: Case) -> None:
     assert found.late is None
 
 
+@pytest.mark.long
 def test_a_lag_is_found_below_what_rang_until_the_payload_was_found() -> None:
     record = recording_of(RINGS_BESIDE_A_LAG)
     first = record.part(0, round(0.4 * len(record)))
@@ -349,6 +360,7 @@ def test_a_lag_is_found_below_what_rang_until_the_payload_was_found() -> None:
     assert said.noise_floor_um < 4.0 * RINGS_BESIDE_A_LAG.rig.sigma_um
 
 
+@pytest.mark.long
 def test_the_hold_that_a_missing_lag_called_for_is_tried_anew() -> None:
     """Beside the wrong hold the latch stood at its bound, and a delay of a sample was named."""
     said = diagnosed(LAG_AND_CREEP)
@@ -357,6 +369,7 @@ def test_the_hold_that_a_missing_lag_called_for_is_tried_anew() -> None:
     assert lag == pytest.approx(LAG_AND_CREEP.effects["amplifier_lag"]["tau_s"], rel=0.003)
 
 
+@pytest.mark.long
 def test_two_causes_are_found_at_once_where_neither_explains_enough_alone() -> None:
     said = diagnosed(DRIFT_AND_BEND)
     drift = next(c for c in said.causes if c.name == "gain_drift").parameters["gain"]
@@ -373,6 +386,7 @@ def test_the_hold_is_the_one_that_fits_best_with_its_own_lag() -> None:
     assert numbers["tau_s"] == pytest.approx(HELD_AT_FIRST.rig.lag_s, rel=0.01)
 
 
+@pytest.mark.long
 def test_the_stages_own_lag_is_not_named_as_a_second_one() -> None:
     """Without the lag that was found, the stage's own comes back under the other hold."""
     said = diagnosed(HELD)
@@ -385,11 +399,13 @@ def test_rests_of_the_second_half_do_not_exclude_a_drift_in_the_first() -> None:
     assert drift_in_rests(readings_of(EARLY_HEAT)).seen is None
 
 
+@pytest.mark.long
 def test_what_only_steadies_an_earlier_cause_in_held_out_stretches_is_no_cause() -> None:
     """Plays of 0.2 nm took 57 % off the held-out error of a drift, and 4 % off that of the fit."""
     assert {c.name for c in diagnosed(STEADIED).causes} == {"thermal_drift"}
 
 
+@pytest.mark.long
 def test_a_faint_drift_of_the_rests_counts_as_seen_where_the_fit_has_its_size() -> None:
     sight = drift_in_rests(readings_of(FAINT))
     assert sight.seen is None
