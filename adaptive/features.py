@@ -165,7 +165,7 @@ class FeatureMap:
     linear: Annotated[bool, Entry("whether the basis holds more than the constant")] = True
     asymmetric: Annotated[bool, Entry("whether it holds the plays times y")] = False
     y_rest_um: Annotated[float, Entry("where the plays rest, in the frame", "µm")] = 0.0
-    gain: Annotated[float, Entry("gain of the frame")] = 1.0
+    gain: Annotated[float, Entry("gain of the frame", low=1e-6)] = 1.0
     offset_um: Annotated[float, Entry("offset of the frame", "µm")] = 0.0
     dead_um: Annotated[float, Entry("dead band of the arcs' path, some deviations of the motion's noise", "µm")] = 0.0
 

@@ -69,7 +69,7 @@ from numba.core.dispatcher import Dispatcher
 
 import adaptive.online
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online import drift, gates, glitch_or_jump, intake, learner
+from adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftConfig, RestCreep
 from adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
@@ -644,6 +644,7 @@ RULES: Final = (
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
     Rule("identified model during a trial", ((Parts, "watch_trial", _never_alone),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
+    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
 )  # fmt: skip
 
 

@@ -98,6 +98,16 @@ def check_file(option: str, path: Path) -> None:
         ) from error
 
 
+def check_folder(out: Path) -> None:
+    """Raise InputError unless a folder ``out`` can be written to or made, before anything is computed for it."""
+    there = next(place for place in (out, *out.absolute().parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error
+
+
 def clear_output(out: Path, names: Iterable[str] = ()) -> None:
     """Create ``out`` if missing, and remove the files and folders called ``names`` in it; others stay.
 

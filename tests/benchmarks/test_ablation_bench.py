@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.online import sensor_trust
 from adaptive.online.glitch_or_jump import level_of
 from adaptive.online.learner import Judgement
 from benchmarks import ablation
@@ -121,7 +120,7 @@ def test_a_shift_reaches_compiled_code_and_what_calls_it() -> None:
 def test_a_shift_reaches_importers() -> None:
     def shifted() -> tuple[int, int]:
         shift(constant("sensor_trust.STILL_STEPS"), 40)
-        return ablation.intake.STILL_STEPS, sensor_trust.STILL_STEPS
+        return ablation.intake.STILL_STEPS, ablation.sensor_trust.STILL_STEPS
 
     assert in_a_process(shifted) == (40, 40)
 

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, check, diagnose, write. Returns 0."""
     from service.reports.diagnosis import Source, write_report
-    from service.storage.output import clear_output
+    from service.storage.output import check_folder
     from sim.diagnosis.diagnose import diagnose_prepared
     from sim.diagnosis.prepare import prepare
     from sim.stage.file import load_stage
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     nominal = load_stage(args.stage) if args.stage is not None else args.nominal
     recording = load(args.data, args, args.range)
     test = None if args.test is None else load(args.test, args, args.test_range, test=True)
-    clear_output(args.out)
+    check_folder(args.out)
     prepared = prepare(recording, nominal=nominal, test=test)
     say(describe(recording, list(prepared.findings)))
     for note in prepared.notes:

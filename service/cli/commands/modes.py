@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, fit, judge, write. Returns 0."""
     from service.reports.modes import write_modes
-    from service.storage.output import clear_output
+    from service.storage.output import check_folder
     from sim.modal import FitSettings, study
     from sim.modal.reading import read_periodic
 
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             f"{record.name}: {drives} drives, {record.y_um.shape[1]} outputs, {realisations} realisations of {periods} "
             f"periods of {samples} samples at {1.0 / record.dt_s:.6g} Hz, {record.amplitude_V:.4g} V rms"
         )
-    clear_output(args.out)
+    check_folder(args.out)
     found = study(
         records,
         tests,

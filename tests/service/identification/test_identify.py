@@ -154,7 +154,7 @@ def test_a_model_that_cannot_be_identified_does_not_take_the_others_along() -> N
         (("--unit", "y=inch"), "unit of y: got 'inch'"),
         (("--column", "y=u_V", "--column", "u=y_um", "--scale", "u=1", "--scale", "y=1"), "look swapped"),
         (("--map", "none.toml"), "none.toml: cannot be read"),
-        (("--out", "/nowhere/m.npz"), "a folder that exists"),
+        (("--out", "/nowhere/m.npz"), "a folder that can be written to"),
     ],
 )
 def test_bad_requests_get_a_message_and_status_2(
