@@ -43,6 +43,8 @@ FAR_OUT = 1.5
 LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
 #: Time between two such checks, s.
 LOOK_S = 0.002
+#: A reading that repeats for this time, s, while the voltage moves, is a fault of the sensor and no missing reading.
+REPEATED_S = 0.1
 #: Share of the identified range beyond its ends up to which the model is valid.
 KNOWN = 0.05
 #: Largest deviation of a reckoned place, as a share of the range, for a hold to begin from a past place.
@@ -255,8 +257,10 @@ class Intake:
         return [before_V + slope_V * (i + 1) for i in range(min(missing, MOST_BRIDGED))]
 
     def _without_reading(self, hold: Hold, refused: str) -> Taken:
-        """A held sample whose reading was refused; after too many, the next reading begins anew."""
-        if len(hold.y_um) < MOST_BRIDGED:
+        """A held sample whose reading was refused. A reading that is repeated for long goes on trial; after too many
+        refused ones, the next begins anew."""
+        repeated = self._judges and self.gates.same * self.dt_s >= REPEATED_S
+        if len(hold.y_um) < MOST_BRIDGED and not repeated:
             return Taken(refused)
         if self._judges:
             return self._begin_trial(hold.reckoning)

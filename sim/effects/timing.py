@@ -24,10 +24,10 @@ from sim.fitting.calibration import calibrate, evaluate
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.lags import resample_by
 from sim.fitting.stage_model import CauseModel, Guess, ModelFit, StageModel, single_guesses
-from sim.readings.lateness import SlipList, lateness
 from sim.readings.sight import Sight
 
 if TYPE_CHECKING:
+    from sim.readings.lateness import SlipList
     from sim.readings.readings import Readings
 
 
@@ -483,7 +483,9 @@ def change_of_lateness(readings: Readings) -> LatenessChange:
 
     A clock error makes it grow in proportion to time; lost or doubled samples make it jump by whole samples.
     """
-    from scipy import stats  # a simulated stage does not wait for it
+    from scipy import stats  # a simulated stage waits for neither
+
+    from sim.readings.lateness import lateness
 
     data = readings.data
     t, d, e = readings.lateness

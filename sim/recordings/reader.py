@@ -118,11 +118,14 @@ def _head(path: Path, digest: Any) -> bytes:
 
 
 def _content(path: Path) -> bytes:
+    content = bytearray()
     with text.opened_bytes(path) as file:
-        content = file.read(MAX_BYTES + 1)
+        # In pieces: a read of so much takes the memory first, whatever the file holds.
+        while len(content) <= MAX_BYTES and (piece := file.read(1 << 22)):
+            content += piece
     if len(content) > MAX_BYTES:
         raise InputError(f"{path}: got more than {MAX_BYTES / 1e9:g} GB, expected at most that: cut it first")
-    return content
+    return bytes(content)
 
 
 _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
