@@ -10,13 +10,13 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.effects.timing import (
-    SlipList,
     best_slip_move,
     date_slips,
     find_slips,
     merge_close_slips,
     without_small_slips,
 )
+from sim.readings.lateness import SlipList
 
 N = 6000
 NOISE_UM = 0.005
