@@ -257,10 +257,10 @@ class Intake:
         return [before_V + slope_V * (i + 1) for i in range(min(missing, MOST_BRIDGED))]
 
     def _without_reading(self, hold: Hold, refused: str) -> Taken:
-        """A held sample whose reading was refused. A reading that is repeated for long goes on trial; after too many
-        refused ones, the next begins anew."""
-        repeated = self._judges and self.gates.same * self.dt_s >= REPEATED_S
-        if len(hold.y_um) < MOST_BRIDGED and not repeated:
+        """A held sample whose reading was refused. A sensor that repeats itself for long goes on trial; after too many
+        other refused readings, the next one begins anew."""
+        repeats = refused == admission.GLITCH and len(hold.y_um) * self.dt_s >= REPEATED_S
+        if len(hold.y_um) < MOST_BRIDGED and not (repeats and self._judges):
             return Taken(refused)
         if self._judges:
             return self._begin_trial(hold.reckoning)

@@ -1032,6 +1032,19 @@ def test_a_coarse_sensor_at_rest_is_not_stuck_and_its_jump_is_believed(model: Ls
     assert learner.counters()["jumps"] == 1
 
 
+def test_a_missing_reading_at_rest_is_no_repeated_one(
+    before_sticking: dict[int, dict[str, object]], all_strokes: Recording
+) -> None:
+    at, (u, y) = 4123, (column.copy() for column in all_strokes)
+    u[at : at + 450], y[at : at + 450] = u[at - 1], y[at - 1]
+    y[at + 400] = math.nan
+    learner = Learner.from_state(before_sticking[at])
+    assert learner.parts.intake._judges
+    before = learner.counters()["trials"]
+    feed_readings(learner, u, y, at, at + 450)
+    assert learner.counters()["trials"] == before
+
+
 def test_a_jump_that_never_was_is_taken_back_when_the_model_of_the_beginning_is_right(
     before_sticking: dict[int, dict[str, object]], all_strokes: Recording
 ) -> None:
