@@ -97,14 +97,17 @@ _MOST_TEXT_BYTES = 4 * MAX_BYTES
 def _head(path: Path, digest: Any) -> bytes:
     """The beginning of a file; ``digest`` takes all of it, in pieces. Raises InputError."""
     try:
+        size, head = path.stat().st_size, b""
         with path.open("rb") as file:
-            while piece := file.read(1 << 22):
-                digest.update(piece)
-        size, head = 0, b""
-        with text.opened_bytes(path) as file:
             while size <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
                 head = head or piece[:_HEAD_BYTES]
-                size += len(piece)
+                digest.update(piece)
+        if text.is_packed(path):
+            size, head = 0, b""
+            with text.opened_bytes(path) as file:
+                while size <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
+                    head = head or piece[:_HEAD_BYTES]
+                    size += len(piece)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise InputError(f"{path}: is not a whole gzip file ({error}), expected one: pack it again") from error
     except OSError as error:
