@@ -113,10 +113,9 @@ def clear_output(out: Path, names: Iterable[str] = ()) -> None:
 
     Raises InputError if the folder cannot be written to.
     """
+    check_folder(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass  # a folder that is there may still be read only
         for name in names:
             path = out / name
             if path.is_dir():
