@@ -87,7 +87,7 @@ class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
     numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
-    dead band of the frame that is served. marks : (B, 4, 1 + p, p) estimates and covariances, see ``MARKS``; ages :
+    dead band of the frame that is served. marks : (B, 2, 1 + p, p) estimates and covariances, see ``MARKS``; ages :
     when they were made. basis : (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more
     than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
     places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of

@@ -231,10 +231,6 @@ class Hold:
         self.slope, self.shift_um = slope * self.slope, slope * self.shift_um + shift_um
         self.jumped, self.good, self.rang = len(self.y_um), 0, 0
 
-    def shift(self, by_um: float) -> None:
-        """Move the expected readings by ``by_um``."""
-        self.shift_um += by_um
-
 
 def tolerance_um(now: Circumstances, reckoning: Reckoning) -> float:
     """Largest distance of a good reading from the dead-reckoned position, µm; it grows with the travelled distance."""

@@ -474,16 +474,16 @@ class Intake:
 
     # ---- readings on trial
 
-    def distrust(self, model: Model) -> Taken | None:
-        """The readings do not follow the drive: begin a trial with the next sample, unless one is open.
+    def distrust(self, model: Model) -> bool:
+        """The readings do not follow the drive: begin a trial with the next sample. Returns whether one has begun.
 
         The place is reckoned from one at which they still followed, over the voltages since.
         """
         track = self.track
         if track is None or track.motion is None or self._trial is not None:
-            return None
+            return False
         if not (self._judges or self.following.still >= STILL_STEPS):
-            return None
+            return False
         if self._hold is not None:
             reckoning = self._hold.reckoning
         elif self._pasts:
@@ -492,7 +492,8 @@ class Intake:
             self._proven_past = self._proven_past or self._clean_past()
         else:
             reckoning = self._begin_hold(track, model()).reckoning
-        return self._begin_trial(reckoning)
+        self._begin_trial(reckoning)
+        return True
 
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
         track, proven = self.track, self._proven

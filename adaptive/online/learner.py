@@ -702,8 +702,7 @@ class Learner:
         p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
         if saturated or not intake.follow(pair, p_V, parts.check_s):
             return ""
-        taken = intake.distrust(self.snapshot)
-        if taken is None:
+        if not intake.distrust(self.snapshot):
             return ""
         self._go_on_without_readings()
         return admission.UNTRUSTED

@@ -85,6 +85,7 @@ class MissingMotion:
         top_um, bottom_um = max(from_um, to_um), min(from_um, to_um)
         fastest = float(np.max(np.abs(model.domain[2:4])))
         hardest = float(np.max(np.abs(model.domain[4:6])))
+        # A turn with the acceleration a takes the stage a t² / 8 beyond both places.
         reach_um = max(0.0, min(0.5 * (fastest * seconds - (top_um - bottom_um)), hardest * seconds**2 / 8.0))
         above = min(reach_um, max(0.0, float(model.domain[1]) - top_um))
         below = min(reach_um, max(0.0, bottom_um - float(model.domain[0])))
