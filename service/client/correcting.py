@@ -17,7 +17,7 @@ from service.answers.guard import Limits
 from service.config.correction import CorrectionConfig
 from service.config.schema import build_settings, keys_of
 from service.protocol.errors import FieldError
-from service.protocol.samples import column
+from service.protocol.samples import column, sequence
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
 #: Displacement, µm, velocity, µm/s, and acceleration, µm/s², (n,) each.
@@ -73,9 +73,9 @@ class Correcting:
     def read(self, seq: ArrayLike, y_um: ArrayLike) -> None:
         """Take the (n,) readings ``y_um``, µm, of the samples ``seq``, rising; those that were taken are left out.
 
-        Raises FieldError if the lengths differ or the numbers do not rise; then nothing changes.
+        Raises FieldError if the lengths differ, or the numbers are not whole or do not rise; then nothing changes.
         """
-        numbers, y = np.atleast_1d(np.asarray(seq, dtype=np.int64)), column("y_um", y_um)
+        numbers, y = sequence("seq", seq), column("y_um", y_um)
         if numbers.size != y.size:
             raise FieldError("y_um", f"{y.size} values", f"{numbers.size}, as many as seq")
         if numbers.size > 1 and not (np.diff(numbers) > 0).all():

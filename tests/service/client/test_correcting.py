@@ -189,7 +189,11 @@ def test_a_block_of_points_carries_one_correction() -> None:
 
 @pytest.mark.parametrize(
     ("seq", "y_um", "wrong"),
-    [([3, 4], [1.0], "y_um: got 1 values, expected 2"), ([4, 4], [1.0, 1.0], "seq: got .*expected rising")],
+    [
+        ([3, 4], [1.0], "y_um: got 1 values, expected 2"),
+        ([4, 4], [1.0, 1.0], "seq: got .*expected rising"),
+        ([3.5], [1.0], "seq: got .*expected whole numbers"),
+    ],
 )
 def test_readings_that_cannot_be_are_refused_and_change_nothing(seq: Any, y_um: Any, wrong: str) -> None:
     one = follower()
