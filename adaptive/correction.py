@@ -1,9 +1,9 @@
-"""A guarded integral of the residual, for who has fresh readings: voltage = feedforward + correction.
+"""A guarded integral of the residual, for clients with fresh readings: voltage = feedforward + correction.
 
 The correction is an integral of the residual (wanted less read, both of the reading's own sample), behind a low-pass of
 first order, times the model's slope dV/dy. `design` chooses its gain from the delay of the readings, the lag of the
-stage and the lowest frequency at which it may ring. `Correction` holds it: within a bound, not from readings that are
-doubted, not from the noise of a stage at rest, and with half the gain once it oscillates.
+stage and the lowest frequency at which it may ring. `Correction` keeps it within a bound, leaves out doubted readings
+and the noise of a stage at rest, and halves the gain once it oscillates.
 """
 
 from __future__ import annotations

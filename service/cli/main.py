@@ -189,7 +189,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
 
 
 def _give_up_stdout() -> None:
-    """Where standard output takes no more, let the end of the process not try again."""
+    """Point standard output to the null device once it takes no more, so that the exit does not fail."""
     try:
         sys.stdout.flush()
     except OSError:
