@@ -6,7 +6,7 @@ OUT    ?= out/demo
 SEED   ?= 0
 # Tests of real processes: two at a time, the longest first. Whatever is not listed here only computes. What judges times
 # is marked "alone", and runs so at the end.
-PROCESSES := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py test_demo.py) \
+PROCESSES := $(addprefix tests/e2e/,test_soak.py test_scale.py test_demo.py) \
           tests/service/failover tests/service/protocol/test_fuzz.py \
           $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py test_restart_bench.py) \
           $(addprefix tests/service/,viewer/test_sink.py viewer/test_live.py operating security \
