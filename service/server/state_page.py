@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from typing import Any, Final
 
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.kernel_window import KernelSolverState
 from adaptive.online.learner import Parts
-from adaptive.state import rows
+from adaptive.state import Row, rows
 from baselines.bouc_wen.model import BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
 from baselines.competition.champion import ChampionEntries
@@ -62,16 +63,29 @@ _TABLES: Final[tuple[tuple[str, str, Any], ...]] = (
 
 def page() -> str:
     """The page in Markdown."""
-    lines = [_TITLE]
+    lines, listed = [_TITLE], dict[tuple[tuple[str, ...], ...], str]()
     for title, where, cls in _TABLES:
         apart = {LssvmInverse, FeatureMap} - {cls}
         lines += [f"## {title}", "", "| entry | value | meaning |", "|---|---|---|"]
-        for row in rows(cls, where, apart):
-            value = ", ".join(filter(None, (row.shape and f"({row.shape})", row.unit, row.range)))
-            cells = (f"`{row.name}`", value, row.meaning)
-            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        lines.append("")
+        lines += [*_cells(list(rows(cls, where, apart)), listed), ""]
     return "\n".join(lines)
+
+
+def _cells(found: list[Row], listed: dict[tuple[tuple[str, ...], ...], str]) -> Iterator[str]:
+    """The lines of a table. The entries of a record are listed once; ``listed`` holds where."""
+    skipped = "-"
+    for i, row in enumerate(found):
+        if row.name.startswith(skipped):
+            continue
+        meaning = row.meaning
+        if row.name.endswith("."):
+            inner = [r for r in found[i + 1 :] if r.name.startswith(row.name)]
+            record = tuple((r.name.removeprefix(row.name), r.shape, r.unit, r.range, r.meaning) for r in inner)
+            first = listed.setdefault(record, row.name)
+            if len(record) > 2 and first != row.name:
+                skipped, meaning = row.name, f"{meaning}; entries as in `{first}`"
+        value = ", ".join(filter(None, (row.shape and f"({row.shape})", row.unit, row.range)))
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in (f"`{row.name}`", value, meaning)) + " |"
 
 
 def main() -> None:
