@@ -452,7 +452,7 @@ def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Ro
             if slot.of not in apart:
                 yield from rows(slot.of, inner, apart)
             continue
-        limits = [_range(entry), "" if entry.finite else "may be NaN or infinite"]
+        limits = [_range(entry), "" if entry.finite else "or not finite"]
         if slot.kind == "named":
             names = entry.among if entry.among and not slot.name else ("NAME",)
             name = f"{name}.NAME" if slot.name else prefix + ", ".join(names)
