@@ -625,8 +625,6 @@ RULES: Final = (
     Rule("memories after a gap", ((Intake, "_after_gap", _no_missing_motion),)),
     Rule("rest: only the constant is learnt", ((Intake, "rests", _always(False)),)),
     Rule("creep at rest moves the frame", ((RestCreep, "shift_um", _always(0.0)),)),
-    Rule("rail: begin again", ((Parts, "watch_rail", _nothing),)),
-    Rule("envelope: begin again", ((Parts, "watch_shape", _nothing),)),
     Rule("envelope refuses frames", ((EnvelopeConfig, "refuses", _always("")),)),
     Rule("fall back to the frozen model", ((Judgement, "choose", _always(False)),)),
     Rule("roll back to a mark", ((learner, "ROLLBACK_S", math.inf),)),

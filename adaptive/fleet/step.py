@@ -267,25 +267,18 @@ def _finds_fault(
     r.events["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
     fault = j.fallen_s > learner.ROLLBACK_S
     confirmed = places = False
-    if checks:
-        away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
-        outside = f.allowed_V > 0.0 and away_V > f.allowed_V
-        r["left_s"] = learner.time_outside(r.left_s, outside, config.check_s)
-        r["rail_s"] = learner.time_at_rail(r.rail_s, saturated, config.check_s)
-        fault = fault or (outside and r.left_s >= learner.RAIL_S)
-        fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
-        if f.tells and not saturated:
-            follows, fastest_V_per_s = r.front.following, config.envelope.drift_per_s * f.drive_V
-            known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
-            judges = known and r.front.credit > 0
-            p_V = u - target + dot(h, s.marks[b, 0, 0], p)
-            odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
-            if not known:
-                _forget_slopes(follows)
-            fault = fault or (odd and judges) or follows.still >= STILL_STEPS
-            confirmed = judges and (follows.good >= CONFIRMED or r.past_count == 0)
-            # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.
-            places = confirmed or (not judges and follows.steps == 0 and follows.still == 0)
+    if checks and f.tells and not saturated:
+        follows, fastest_V_per_s = r.front.following, config.envelope.drift_per_s * f.drive_V
+        known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
+        judges = known and r.front.credit > 0
+        p_V = u - target + dot(h, s.marks[b, 0, 0], p)
+        odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
+        if not known:
+            _forget_slopes(follows)
+        fault = fault or (odd and judges) or follows.still >= STILL_STEPS
+        confirmed = judges and (follows.good >= CONFIRMED or r.past_count == 0)
+        # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.
+        places = confirmed or (not judges and follows.steps == 0 and follows.still == 0)
     if fault:
         return True
     if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:

@@ -694,10 +694,6 @@ class Intake:
         """Motion with these rates of the voltage, V/s and V/s², has been learnt."""
         np.maximum(self.known[2], np.abs(rates), out=self.known[2])
 
-    def forget_rates(self) -> None:
-        """Only the motion of the identified model is known again."""
-        self.known = known_rates(self.base)
-
     def mark_rates(self) -> None:
         """The present estimate becomes the newer good one."""
         self.known[:2] = self.known[1:]

@@ -158,7 +158,7 @@ class Delay:
 # --- The learner.
 
 #: Names of the events that are counted beside the samples.
-EVENTS = ("fallbacks", "rollbacks", "distrusts", "begun_again", "adoptions", "adoptions_refused")
+EVENTS = ("fallbacks", "rollbacks", "distrusts", "adoptions", "adoptions_refused")
 
 #: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
 #: marked this often, s.
@@ -166,12 +166,8 @@ ROLLBACK_S, MARK_S = 0.5, 1.0
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
-#: Time between two checks of envelope, rails and sensor, s; at least a step of the filter.
+#: Time between two checks of the sensor, s; at least a step of the filter.
 CHECK_S = 0.004
-#: A voltage at a limit for this long, s, with a model error above this share of the span, is caused by the model.
-RAIL_S, RAIL_SHARE = 0.1, 0.05
-#: Time inside the envelope after which ``model_left_envelope`` ends, s.
-LEFT_S = 1.0
 #: While readings are on trial, the identified model is served if its recent rms error is below ``MOVES`` times the
 #: recent motion of the estimate, and below this share of the span. An estimate that hardly moves is far better than
 #: the identified model. One that moved much may have followed a real change of the stage; the share covers that case.
@@ -184,14 +180,6 @@ COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
 NEWEST = 100
 #: Largest move of the output at an adoption, in its stated standard deviations (rms over the newest samples).
 MOST_MOVED = 2.0
-#: Troubles of the model. The identified one is served then.
-RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
-
-
-@shared
-def time_outside(left_s: float, outside: bool, step_s: float) -> float:
-    """Time outside the envelope, or inside where negative, s, after one more check."""
-    return max(left_s, 0.0) + step_s if outside else max(min(left_s, 0.0) - step_s, -LEFT_S)
 
 
 def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float = 0.0) -> FloatArray:
@@ -205,18 +193,12 @@ def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float 
     return rows
 
 
-@shared
-def time_at_rail(rail_s: float, saturated: bool, step_s: float) -> float:
-    """Time of the voltage at a limit, or off it where negative, s, after one more check."""
-    return min(max(rail_s, 0.0) + step_s, RAIL_S) if saturated else max(min(rail_s, 0.0) - step_s, -RAIL_S)
-
-
 class Parts:
     """The changing state of a learner, and the operations on several of its parts.
 
     first : the filter's estimate of the identified model.
     window : the kernel part, whose state is among the entries ``window``.
-    check_every, check_s : samples between two checks of envelope, rails and sensor, and the time between them, s.
+    check_every, check_s : samples between two checks of the sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     """
 
@@ -233,10 +215,6 @@ class Parts:
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
     mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
-    rail_s: Annotated[float, Entry("time at a limit, off it where negative; see ``watch_rail``", "s")]
-    railed: Annotated[bool, Entry("whether the model was given up for that")]
-    left_s: Annotated[float, Entry("time outside the envelope, inside where negative; see ``watch_shape``", "s")]
-    left: Annotated[bool, Entry("whether the model was given up for that")]
     alone: Annotated[bool, Entry("whether the identified model is served because readings are on trial")]
     moved_V: Annotated[float, Entry("how far the estimate had moved before that trial, rms", "V", low=0.0)]
     moved_s: Annotated[float, Entry("within what time", "s", low=1e-9)]
@@ -273,10 +251,6 @@ class Parts:
         self.allowed_V = allowed_V
         v = base.features.v_scale_um_per_s
         self.rows = np.concatenate([basis_over(base.features, COMPARED, way * v) for way in (-1.0, 1.0)])
-        self.rail_s = 0.0
-        self.railed = False
-        self.left_s = 0.0
-        self.left = False
         self.alone = False
         self.moved_V, self.moved_s = 0.0, MARK_S
         self.counters = new_counters()
@@ -333,39 +307,13 @@ class Parts:
             j.rolled_back()
             self.intake.to_base_frame()
             self.filter.go_back(self.mark)
+            # If that estimate does not end it either, the next to return to is the identified one.
+            self.mark = self.next_mark = self.first
             self.events["rollbacks"] += 1
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
             self.intake.mark_rates()
             self.mark_ages = (self.mark_ages[1], j.judged)
-
-    def watch_rail(self, saturated: bool) -> None:
-        """After ``judge``: return to the identified model where the voltage stays at a limit because of the model.
-
-        ``railed`` is True from then until the voltage has been off the limits for as long.
-        """
-        limit_V = RAIL_SHARE * self.filter.span_V
-        self.rail_s = time_at_rail(self.rail_s, saturated, self.check_s)
-        if saturated:
-            if self.rail_s >= RAIL_S and self.judgement.short_V2 > limit_V * limit_V and not self.railed:
-                self.railed = True
-                self.begin_again()
-        else:
-            self.railed = self.railed and self.rail_s > -RAIL_S
-
-    def watch_shape(self, away_V: float) -> None:
-        """Take the distance from the identified linear part, V; return to the identified model where it stays large.
-
-        ``left`` is True from then until it has been inside for a second.
-        """
-        outside = self.allowed_V > 0.0 and abs(away_V) > self.allowed_V
-        self.left_s = time_outside(self.left_s, outside, self.check_s)
-        if outside:
-            if self.left_s >= RAIL_S:
-                self.left, self.left_s = True, 0.0
-                self.begin_again()
-        else:
-            self.left = self.left and self.left_s > -LEFT_S
 
     def watch_trial(self) -> bool:
         """Update ``alone`` after a sample; returns whether it has changed."""
@@ -388,17 +336,6 @@ class Parts:
         self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s
         self.window.keep()
         self.events["distrusts"] += 1
-
-    def begin_again(self) -> None:
-        """Forget everything learnt and start again from the identified model."""
-        base, c = self.intake.base, self.config
-        self.intake.to_base_frame()
-        self.intake.forget_rates()
-        self.filter.go_back(self.first)
-        self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
-        self._mark_now()
-        self.domain = base.domain.copy()
-        self.events["begun_again"] += 1
 
     def take_jump(self, jump_um: float, first: bool) -> None:
         """The frame has moved by ``jump_um``, µm; ``first``: see ``Taken``."""
@@ -498,7 +435,7 @@ class Parts:
     @property
     def ordinary(self) -> bool:
         """Whether samples are learnt in the ordinary way: nothing is in doubt, and nothing is being repaired."""
-        return self.intake.ordinary and not (self.window.heals or self.railed or self.left or self.alone)
+        return self.intake.ordinary and not (self.window.heals or self.alone)
 
     # ---- keeping
 
@@ -662,7 +599,7 @@ class Learner:
         served_V = float(self._basis.dot(parts.delay.push(beta)))
         parts.judge(target - served_V, pair.u_V - frozen_V)
         if pair.now % parts.check_every == 0:
-            found = self._check(pair, beta, target, bool(refused))
+            found = self._check(pair, target, bool(refused))
             if found:
                 return found
         # Where nothing is learnt, the stated deviation is of the errors until now all the same.
@@ -693,12 +630,10 @@ class Learner:
             return admission.SETTLING
         return "" if pair.good else admission.GLITCH
 
-    def _check(self, pair: Pair, beta: FloatArray, target_V: float, saturated: bool) -> str:
-        """Check envelope, rails and sensor. Returns the gate that forbids learning, or ""."""
+    def _check(self, pair: Pair, target_V: float, saturated: bool) -> str:
+        """Check the sensor. Returns the gate that forbids learning, or ""."""
         parts, intake = self.parts, self.parts.intake
         kernel_V = pair.u_V - target_V
-        parts.watch_shape(kernel_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
-        parts.watch_rail(saturated)
         p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
         if saturated or not intake.follow(pair, p_V, parts.check_s):
             return ""
@@ -718,11 +653,8 @@ class Learner:
         """Name of what prevents learning, "" while nothing does.
 
         Of the sensor: ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope``.
-        ``rail`` : the voltage was at a limit because the model was wrong. ``model_left_envelope`` : the learnt model
-        was further from the identified one than a stage can be. The identified model is served then.
         """
-        parts = self.parts
-        return parts.intake.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
+        return self.parts.intake.fault
 
     @property
     def distrusts(self) -> bool:
@@ -732,12 +664,7 @@ class Learner:
     @property
     def why(self) -> str:
         """The reason for ``trouble`` in words, with numbers."""
-        parts = self.parts
-        if parts.intake.fault:
-            return parts.intake.why
-        if parts.railed:
-            return f"the voltage was at a limit for {RAIL_S} s with the model off by more than {100 * RAIL_SHARE:.0f} %"
-        return f"more than {parts.allowed_V:.3g} V from the identified model for {RAIL_S} s" if parts.left else ""
+        return self.parts.intake.why if self.parts.intake.fault else ""
 
     # ---- snapshots out
 

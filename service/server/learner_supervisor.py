@@ -28,7 +28,6 @@ from adaptive.online.gates import (
     TIMING,
     UNEXCITED,
 )
-from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
 from adaptive.state import Entry, Kinded, load, part_of, restore, save
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
@@ -56,12 +55,10 @@ from service.protocol.model import build_model, stored_kind
 # - learner_failed: the learner raised; another one is started from the last good model after a while.
 # - sensor_stuck, sensor_gain, sensor_sign, sensor_foreign, out_of_envelope: the learner reports that the readings do
 #   not follow the voltage as those of this stage can.
-# - rail, model_left_envelope: the voltage was at a limit because the model was wrong, or the model has left the range
-#   in which a stage can be; the learner has restarted from the identified model.
 #
 # During the first three, and while the learner distrusts the sensor, nothing is learnt. Served meanwhile: the last good
-# model from before the trouble; the learner's own where it has itself gone back to before the fault; the identified one
-# where the learner has restarted. A model that was not renewed for ``last_good_s`` gives way to the baseline, over a
+# model from before the trouble; the learner's own where it has itself gone back to before the fault. A
+# model that was not renewed for ``last_good_s`` gives way to the baseline, over a
 # ramp.
 
 SENSOR_FROZEN: Final = "sensor_frozen"
@@ -78,12 +75,9 @@ NOT_LEARNING: Final = "not_learning"
 NOT_COMMANDED: Final = "not_commanded"
 #: Verdicts that are no refusal of a sample in motion.
 _NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
-#: After these the learner has restarted, because the model from before was wrong.
-BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
 #: What lets the learner follow such a change.
 _WIDEN: Final = {
     OUT_OF_ENVELOPE: "if it is real, identify again, or widen learner.envelope.gain or learner.envelope.offset",
-    MODEL_LEFT_ENVELOPE: "if it repeats, identify again, or widen learner.envelope.shape",
 }
 #: During these nothing is learnt.
 POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED, VOLTAGE_DIFFERS}) | SENSOR_FAULTS
@@ -235,9 +229,7 @@ class ModelWatch:
             n["clean"] += elapsed
             if n["clean"] * self._dt_s >= c.recover_s:
                 self.trouble = ""
-        if self.trouble in BEGUN_AGAIN and candidate is not None:
-            self._mark = self._next_mark = self._good = candidate
-        elif self.trouble and distrusts and candidate is not None and self._sane(candidate, identified):
+        if self.trouble and distrusts and candidate is not None and self._sane(candidate, identified):
             # The learner has itself gone back to before the fault, which is better than an old snapshot.
             self._good = candidate
         if self.trouble in ("", NOTHING_LEARNT) and candidate is not None:
@@ -636,9 +628,8 @@ class LearnerSupervisor:
             self._note("recovered", before)
             return
         why = f" ({why})" if why else ""
-        served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
         widen = f"; {_WIDEN[now]}" if now in _WIDEN else ""
-        self._note("trouble", f"{now}{why}: {served} is served, then {stand_in or 'nothing else'}{widen}")
+        self._note("trouble", f"{now}{why}: the last good model is served, then {stand_in or 'nothing else'}{widen}")
 
     def _champion(self, last: Served, good: InverseModel, poisoned: bool) -> dict[str, InverseModel]:
         """The champion under its name. Poisoned samples change no champion, only its model of the learner."""

@@ -17,7 +17,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
 from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig
-from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL, Learner
+from adaptive.online.learner import Learner
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
 from adaptive.state import load, save
 from adaptive.types import FloatArray, Sample, StateDict
@@ -354,29 +354,19 @@ def is_identified(learner: Learner) -> bool:
 
 
 @pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6), doubled])
-def test_a_voltage_at_a_limit_by_the_models_fault_ends_in_the_identified_one(
+def test_a_spoilt_model_is_not_served_while_the_voltage_is_at_a_limit(
     model: LssvmInverse, railed: Recording, spoil: Callable[[Learner], None]
 ) -> None:
-    """Within 0.3 s of it; it has its name until the voltage has left the limit, and then learning goes on."""
-    # No bound of the shape that would find it first.
-    learner = Learner.from_model(model, limited(shape=100.0))
-    at = round(REACHED_S / DT_S) + 100
+    """Within 0.3 s the identified one is, although nothing is learnt there; afterwards learning goes on."""
+    learner = Learner.from_model(model, limited())
+    at, left = round(REACHED_S / DT_S) + 100, round(LEFT_S / DT_S)
     feed(learner, railed, 0, at)
-    assert learner.trouble == ""
     spoil(learner)
     feed(learner, railed, at, at + 300)
-    assert learner.trouble == RAIL
-    assert learner.counters()["begun_again"] >= 1
     assert is_identified(learner)
-    np.testing.assert_array_equal(learner.parts.filter.beta, model.beta)
-    left = round(LEFT_S / DT_S)
-    for k in range(at + 300, left):
-        feed(learner, railed, k, k + 1)
-        assert learner.trouble == RAIL
-    said = feed(learner, railed, left, left + 1000)
+    said = feed(learner, railed, at + 300, left + 1000)
     assert learner.trouble == ""
     assert said[-200:].count("learnt") > 90
-    assert learner.counters()["begun_again"] == 1
     assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
 
 
@@ -387,50 +377,24 @@ def test_a_voltage_at_a_limit_by_the_reference_is_no_trouble(model: LssvmInverse
     for k in range(6000):
         said += feed(learner, railed, k, k + 1)
         assert learner.trouble == ""
-    assert learner.counters()["begun_again"] == 0
     part = slice(round(REACHED_S / DT_S) + 100, round(LEFT_S / DT_S))
     assert set(said[part]) == {"saturated"}
     assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
 
 
-def test_a_voltage_at_a_limit_for_less_than_a_tenth_of_a_second_decides_nothing(model: LssvmInverse) -> None:
-    parts = Learner.from_model(model, limited()).parts
-    parts.judgement.short_V2 = model.span_V**2
-    steps = round(0.09 / parts.check_s)
-    for _ in range(20):
-        for _ in range(steps):
-            parts.watch_rail(True)
-        parts.watch_rail(False)
-    assert parts.events["begun_again"] == 0
-    for _ in range(round(0.11 / parts.check_s)):
-        parts.watch_rail(True)
-    assert parts.railed
-    assert parts.events["begun_again"] == 1
-    # Not again and again: what is wrong now is not what was learnt.
-    for _ in range(500):
-        parts.watch_rail(True)
-    assert parts.events["begun_again"] == 1
-
-
 @pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6)])
-def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
-    model: LssvmInverse, all_strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
+def test_a_spoilt_model_is_not_served_although_learning_is_stopped(
+    all_strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
 ) -> None:
-    """Within 0.3 s, and is told of for a second. The filter may learn meanwhile: from the identified model on."""
+    """Within 0.3 s the identified one is; the filter then learns again, although the good estimates are spoilt too."""
     learner = Learner.from_state(warm)
-    # It would find its way by itself, slowly: held where it is.
     learner.freeze()
     spoil(learner)
     feed(learner, all_strokes, AT, AT + 300)
-    assert learner.trouble == MODEL_LEFT_ENVELOPE
-    assert learner.counters()["begun_again"] == 1
     assert is_identified(learner)
     learner.thaw()
-    told = [learner.trouble for k in range(AT + 300, AT + 2000) if feed(learner, all_strokes, k, k + 1)]
-    assert 700 < told.count(MODEL_LEFT_ENVELOPE) < 1300
-    assert set(told[1300:]) == {""}
-    assert learner.counters()["begun_again"] == 1
-    assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
+    feed(learner, all_strokes, AT + 300, AT + 2300)
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.5
 
 
 @pytest.mark.parametrize(("gain", "shift"), [(0.2, 0.0), (-0.15, 0.0), (0.1, 0.1), (0.0, -0.2)])
@@ -445,7 +409,6 @@ def test_what_is_learnt_of_a_stage_that_changes_much_is_no_trouble(
     for k in range(AT, clean.size):
         feed(learner, (u, y), k, k + 1)
         assert learner.trouble == ""
-    assert learner.counters()["begun_again"] == 0
     assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
 
 
@@ -463,24 +426,3 @@ def test_configuration_and_envelope_go_there_and_back() -> None:
     # Settings from before there was an envelope have its defaults.
     old = {name: value for name, value in state.items() if not name.startswith("envelope.")}
     assert LearnerConfig.from_state(old) == replace(config, envelope=EnvelopeConfig())
-
-
-@pytest.mark.parametrize("trouble", [RAIL, MODEL_LEFT_ENVELOPE])
-def test_state_goes_on_to_the_last_bit_in_trouble(model: LssvmInverse, railed: Recording, trouble: str) -> None:
-    one = Learner.from_model(model, limited(shape=100.0 if trouble == RAIL else 0.25))
-    at = round(REACHED_S / DT_S) + 100 if trouble == RAIL else 2000
-    feed(one, railed, 0, at)
-    if trouble != RAIL:
-        one.freeze()
-    shifted(0.6)(one)
-    # In the middle of the time that it takes, and then of the trouble.
-    feed(one, railed, one.seq + 1, one.seq + 1 + 30)
-    for n in (150, 300, 600):
-        two = Learner.from_state(one.state_dict())
-        for k in range(one.seq + 1, one.seq + 1 + n):
-            assert feed(one, railed, k, k + 1) == feed(two, railed, k, k + 1)
-            assert one.trouble == two.trouble
-        assert one.counters() == two.counters()
-        np.testing.assert_array_equal(one.snapshot().beta, two.snapshot().beta)
-        if n < 600:
-            assert one.trouble == trouble
