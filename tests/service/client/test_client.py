@@ -289,7 +289,7 @@ def test_nobody_there(free_port: int) -> None:
     with pytest.raises(SessionError, match="no answer at"):
         Client.connect(f"tcp/127.0.0.1:{free_port}")
     for wrong in ("localhost", None, 7447, [7447], []):
-        with pytest.raises(InputError, match="^endpoint: got "):
+        with pytest.raises(InputError, match=r"^endpoint: got "):
             Client.connect(wrong)  # type: ignore[arg-type]
     for field in ("timeout_s", "wait_s", "retry_s"):
         for wrong in ("1", None, [1.5], -1.0, float("nan")):
