@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.npy_sizes import check_npy, check_npz
 from sim.recordings.columns import ColumnMap
-from sim.recordings.matlab_process import MOST_ELEMENTS
+from sim.recordings.matlab_process import MOST_ELEMENTS, as_text
 from sim.recordings.table import MAX_BYTES, Table, plain_arrays
 from sim.recordings.text_formats import different, from_arrow, has_names, is_number, plain_number, units_row
 
@@ -159,7 +159,7 @@ class _Hdf5:
     def _add_dataset(self, group: Any, name: str, member: Any, depth: int) -> None:
         if isinstance(member, self.h5py.Dataset) and self.h5py.check_ref_dtype(member.dtype) is self.h5py.Reference:
             self._add_elements(group, name, member, depth)
-        elif reason := self._unreadable(member):
+        elif reason := self._unreadable(name, member):
             self.left_out.append(f"{name} ({reason})")
         elif member.dtype.names is not None and not _is_complex(member.dtype):
             self._add_fields(name, member)
@@ -193,7 +193,7 @@ class _Hdf5:
             else:
                 self.left_out.append(f"{name}.{field} (no numbers)")
 
-    def _unreadable(self, member: Any) -> str:
+    def _unreadable(self, name: str, member: Any) -> str:
         """Why a member holds no array of numbers; "" where it does."""
         if not isinstance(member, self.h5py.Dataset):
             return "no array"
@@ -203,8 +203,9 @@ class _Hdf5:
         if "MATLAB_empty" in member.attrs:
             return "empty"
         if matlab and matlab not in ("double", "single", "logical") and not matlab.startswith(("int", "uint")):
-            save = ": save its columns as arrays" if "table" in matlab or matlab == "timeseries" else ""
-            return {"char": "text", "cell": "cells", "struct": "a struct array"}.get(matlab, f"a {matlab}{save}")
+            return {"char": "text", "cell": "cells", "struct": "a struct array"}.get(
+                matlab, f"a {matlab}{as_text(name)}"
+            )
         if member.dtype.kind in "fiub" or member.dtype.names is not None:
             return ""
         return "no numbers"
