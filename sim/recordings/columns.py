@@ -80,8 +80,8 @@ class ColumnMap:
     columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 u3 monitor temperature``,
         and the scalars ``dt`` and ``rate``); in text and workbooks also its position from 1 (``"2"``), or several
         neighbours as one array (``"2:6"``).
-    units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``, or an angle, which becomes µrad: ``urad mrad
-        rad arcsec arcmin deg``; ``s ms us ns min day``; ``C K``; ``Hz kHz``).
+    units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; angles, which become µrad: ``urad
+        mrad rad arcsec arcmin deg``; ``s ms us ns min day``; ``C K``; ``Hz kHz``).
     scale : quantity -> factor from the file's number to the canonical unit, in place of a unit, for a column in
         another quantity (10 for a sensor of 10 µm per volt).
     index : quantity -> part of an array of several dimensions, with one ``:`` for the samples (``":,0,2"``), and
