@@ -67,7 +67,8 @@ def test_the_servo_of_the_page_gains_by_the_model_and_makes_no_step(
 ) -> None:
     write_examples(tmp_path / "files")
     files = (str(tmp_path / "files" / "recording.csv"), str(tmp_path / "stage.npz"))
-    assert main(["identify", files[0], "--out", files[1], "--models", "lssvm_adaptive", "--no-pictures", "--quiet"]) == 0
+    options = ["--models", "lssvm_adaptive", "--no-pictures", "--quiet"]
+    assert main(["identify", files[0], "--out", files[1], *options]) == 0
     capsys.readouterr()
     monkeypatch.setattr("sys.argv", ["servo.py", files[1], str(tmp_path / "servo.png")])
     said = runpy.run_path(str(ROOT / "examples" / "servo.py"), run_name="__main__")

@@ -197,7 +197,7 @@ SCOPES: dict[str, tuple[str, str, dict[str, str]]] = {
         {"FACTOR": "10"},
     ),
     "Yokogawa": (YOKOGAWA, ",{u:.6E},{v:.6E},\n", {"FACTOR": "10"}),
-    "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {}),
+    "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {"HZ": "1000"}),
     "LabVIEW's waveforms": (LABVIEW, commas("{clock}\t{u:.6f}\t{y:.6f}\n").replace(":,", ":."), {}),
     "BenchLink": (BENCHLINK, "{k},{day}:{rest:03d},{u:.5E},0,{v:.6E},0\n", {"FACTOR": "10"}),
     "a counter in place of a time": ("Sample,U (V),Y (um)\n", "{k},{u:.5f},{y:.5f}\n", {"HZ": "1000"}),
@@ -389,7 +389,7 @@ def test_a_sheet_of_dates_and_numbers_in_one_column_is_refused(tmp_path: Path) -
     mixed = [[datetime(2026, 1, 1) if k % 2 else 1.0, u, y] for k, (_, u, y) in enumerate(TABLE)]
     workbook(tmp_path / "a.xlsx", [NAMES, *mixed])
     with pytest.raises(InputError, match="expected a number"):
-        read(tmp_path / "a.xlsx")
+        read(tmp_path / "a.xlsx", ColumnMap({"t": "1", "u": "2", "y": "3"}, {"t": "s", "u": "V", "y": "um"}))
 
 
 @pytest.mark.parametrize(
