@@ -330,7 +330,7 @@ def _layout(
     if named is None and names is None and not above:
         first = [split_cells(lines[start], block.delimiter)[j] for j in columns]
         if len(columns) == len(block.kinds):
-            has_names(source, first, mapping, "line", start + 1)
+            has_names(source, first, mapping, start + 1)
     preamble = _preamble(lines[: max(start, 40)], block.delimiter)
     if names is None:
         names = [str(j + 1) for j in columns]
@@ -417,7 +417,7 @@ def _names_above(
         return cells, {}, [f"columns named by the comment above the samples: {', '.join(cells)}"]
     if any(is_number(cell, block.decimal) for cell in cells):
         if all(_is_comment(lines[k]) for k in above[:-1]):
-            has_names(source, cells, mapping, "line", last + 1)
+            has_names(source, cells, mapping, last + 1)
         return None, {}, []
     if any(_kind(cell, block.decimal) == "d" for cell in cells):
         return None, {}, []
