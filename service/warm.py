@@ -49,7 +49,9 @@ def make_bytecode(root: Path) -> list[str]:
 #: Names of the folders that pip installs into.
 _INSTALLED = ("site-packages", "dist-packages")
 #: Compiled loops of a whole installation, for the progress; a little more or less does not matter.
-_LOOPS = 150
+_LOOPS = 170
+#: Pause between two looks at the disk, and between two lines of progress in a log, s.
+_LOOK_S, _SAID_EVERY_S = 0.5, 10.0
 _ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -75,14 +77,13 @@ def compile_all(root: Path, out: TextIO) -> int:
         return 0
     forget(root)
     start = time.perf_counter()
-    print("compiling the loops, once (a minute or two) ...", file=out, flush=True)
+    print("compiling the loops, once: 2 minutes on two idle cores, longer on busy ones ...", file=out, flush=True)
     children = [
         subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
         for group in GROUPS
     ]
     failed: list[object] = list(make_bytecode(root))
-    if out.isatty():
-        _show_progress(root, children, out)
+    _show_progress(root, children, out)
     failed += [child.args for child in children if child.wait() != 0]
     if failed:
         print(f"service.warm: compiling failed: {failed}", file=sys.stderr)
@@ -94,13 +95,21 @@ def compile_all(root: Path, out: TextIO) -> int:
 
 
 def _show_progress(root: Path, children: Sequence[subprocess.Popen[bytes]], out: TextIO) -> None:
-    """A bar that grows with the machine code on the disk, until all ``children`` have ended."""
+    """How far it is by the machine code on the disk, until all ``children`` have ended: a bar, or lines in a log."""
+    start_s = said_s = time.monotonic()
+    bar = "\r  [{:<30}] {}" if out.isatty() else ""
     while any(child.poll() is None for child in children):
+        now_s = time.monotonic()
         done = sum(1 for package in PACKAGES for _ in (root / package).rglob("*.nbi"))
-        bar = "#" * min(30, 30 * done // _LOOPS)
-        print(f"\r  [{bar:<30}] {done} loops", end="", file=out, flush=True)
-        time.sleep(0.5)
-    print(file=out)
+        text = f"{done} of some {_LOOPS} loops, {now_s - start_s:.0f} s"
+        if bar:
+            print(bar.format("#" * min(30, 30 * done // _LOOPS), text), end="", file=out, flush=True)
+        elif now_s - said_s >= _SAID_EVERY_S:
+            said_s = now_s
+            print(f"  {text}", file=out, flush=True)
+        time.sleep(_LOOK_S)
+    if bar:
+        print(file=out)
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ from service.protocol.samples import (
     encode_reference,
     encode_samples,
     number,
+    waiting_time,
 )
 from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
 from service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
@@ -143,6 +144,8 @@ def continued(
 _LOGGER: Final = logging.getLogger("dehyst.client")
 _T = TypeVar("_T")
 _BEHIND_PAUSE_S: Final = 0.001
+#: Pause between two questions how far the service has learnt, s.
+_LEARNT_PAUSE_S: Final = 0.01
 #: Default time for which an unanswered query is repeated, s. A standby takes over within some hundredths of a second if
 #: the service has died, within about a second if it has only stopped.
 RETRY_S: Final = 2.0
@@ -291,7 +294,7 @@ class RetryingQueries:
                 return self._first(self._querier.get(**sent), question, read)
             return self._first(self._long.get(**sent, source_info=self._source), question, read)
 
-        start = time.monotonic()
+        start, wait_s = time.monotonic(), waiting_time("wait_s", wait_s)
         while True:
             answer = self._repeated(ask)
             if not answer.behind:
@@ -421,6 +424,8 @@ class Client:
         Raises SessionError if the endpoint does not answer, NoReplyError if the axis is not served there.
         """
         keys = Keys(stage, axis)
+        timeout_s, retry_s = waiting_time("timeout_s", timeout_s), waiting_time("retry_s", retry_s)
+        wait_s = waiting_time("wait_s", wait_s)
         until = time.monotonic() + max(wait_s, _SETTLE_S)
         session = open_client(endpoint, wait_s, zenoh_config)
         try:
@@ -626,6 +631,7 @@ class Client:
 
         Raises CommandHeldError, which names the other controller.
         """
+        wait_s = waiting_time("wait_s", wait_s)
         self._own().take(wait_s, force)
 
     def _own(self) -> CommandLease:
@@ -653,6 +659,22 @@ class Client:
         payload, key = encode_samples(seq, t_s, u_V, y_um), self.keys.sample
         attached = self._by.published(key, payload)
         self._session.put(key, payload, attachment=attached, express=True, congestion_control=SURELY)
+
+    def wait_learnt(self, seq: int, wait_s: float = 10.0) -> int:
+        """Wait until the service has learnt up to sample ``seq``; returns the number of the last one that it has.
+
+        For a simulation that runs faster than real time: without it more samples wait than the service can hold, and
+        are dropped. Raises BehindError after ``wait_s``.
+        """
+        seq, until = check_seq("seq", seq), time.monotonic() + waiting_time("wait_s", wait_s)
+        while (learnt := int(self.status()["seq"])) < seq:
+            if time.monotonic() >= until:
+                raise BehindError(
+                    f"{self.keys.base}: the service has learnt up to sample {learnt} and not up to sample {seq} within "
+                    f"{wait_s:g} s: allow more wait_s; samples must come in the order of their numbers, up to this one"
+                )
+            time.sleep(_LEARNT_PAUSE_S)
+        return learnt
 
     def subscribe_commands(self, receive: Callable[[bytes], None]) -> CommandGate:
         """Call ``receive`` with the payload of each command of the owner of ``.../command``, in a thread of zenoh.

@@ -40,7 +40,7 @@ from service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
-from service.protocol.samples import column
+from service.protocol.samples import check_seq, column, number, sequence, waiting_time
 from service.security.authenticator import NO_KEY, Heard
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
@@ -297,9 +297,7 @@ class Follower:
         except BaseException:
             self.close()
             raise
-        self.memory: FloatArray = (
-            self._newest[0].memory.copy() if memory is None else np.array(memory, dtype=np.float64).reshape(-1)
-        )
+        self.memory: FloatArray = self._newest[0].memory.copy() if memory is None else self._own_memory(memory)
         self._u_before_V = math.nan
         #: What is still added to the next voltage since the memory was resynchronised, V.
         self._fade_V = 0.0
@@ -342,6 +340,7 @@ class Follower:
 
     def wait(self, seq: int, timeout_s: float) -> bool:
         """Wait until the newest state has seen sample ``seq``; False if it has not after ``timeout_s``."""
+        seq, timeout_s = check_seq("seq", seq), waiting_time("timeout_s", timeout_s)
         with self._moved:
             return self._moved.wait_for(lambda: self.snapshot_seq >= seq, timeout_s)
 
@@ -388,22 +387,25 @@ class Follower:
             self.correcting.read(seq, y_um)
 
     def point(self, y_um: float, v_um_per_s: float = 0.0, a_um_per_s2: float = 0.0, *, seq: int | None = None) -> float:
-        """The voltage, V, for the next point. Raises InputError if it is outside the domain or not finite.
+        """The voltage, V, for the next point. Raises InputError if it is outside the domain or no finite number.
 
         seq : number of its sample; None: the one after the last point.
         """
-        self._number = self._number if seq is None else seq
         limits = self.limits
+        # The compiled functions exist for floats; another number type would be compiled anew, which takes seconds.
+        if not type(y_um) is type(v_um_per_s) is type(a_um_per_s2) is float:
+            y_um, v_um_per_s = number("y_um", y_um), number("v_um_per_s", v_um_per_s)
+            a_um_per_s2 = number("a_um_per_s2", a_um_per_s2)
         if not (limits.y_min_um <= y_um <= limits.y_max_um and math.isfinite(v_um_per_s + a_um_per_s2 + y_um)):
             raise FieldError(
                 "y_um, v_um_per_s, a_um_per_s2",
                 f"{y_um:g}, {v_um_per_s:g}, {a_um_per_s2:g}",
                 f"finite numbers, y_um from {limits.y_min_um:g} to {limits.y_max_um:g}",
             )
+        self._number = self._number if seq is None else check_seq("seq", seq)
         message = self._newest[0]
         model, after = message.model, self.memory.copy()
-        # The compiled functions exist for floats; another number type would be compiled anew, which takes seconds.
-        motion = float(y_um), float(v_um_per_s), float(a_um_per_s2)
+        motion = y_um, v_um_per_s, a_um_per_s2
         if type(model) is ChampionInverse:
             answer = model.evaluate_point(*motion, after, self._one)
         elif type(model) is LssvmInverse and after.size == model.memory_size:
@@ -440,14 +442,10 @@ class Follower:
 
         seq : number of the first one's sample; None: the one after the last point. A correction is the same for all n.
         """
-        self._number = self._number if seq is None else seq
-        y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
-        model = self._newest[0].model
-        v, a = derivatives(y, v_um_per_s, a_um_per_s2, model.dt_s)
-        for field, values in (("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
-            if not np.isfinite(values).all():
-                raise FieldError(field, "NaN or infinity", "finite numbers")
+        y = column("y_um", y_um)
+        v, a = derivatives(y, v_um_per_s, a_um_per_s2, self._newest[0].model.dt_s)
         check_domain(y, self.limits)
+        self._number = self._number if seq is None else check_seq("seq", seq)
         self.last_trajectory = got = self._safely((y, v, a))
         return got.u_V, got.flags
 
@@ -464,11 +462,11 @@ class Follower:
             the memory goes straight, and is wrong where the stage turned meanwhile.
         u_V, y_um : (n,) voltages that were applied, V, and readings, µm. Samples that are not finite are left out.
 
-        Raises FieldError if the lengths differ or the numbers do not rise; then nothing changes.
+        Raises FieldError if the lengths differ, or the numbers are not whole or do not rise; then nothing changes.
         """
         message = self._newest[0]
         model = message.model
-        numbers, u, y = np.atleast_1d(np.asarray(seq, dtype=np.int64)), column("u_V", u_V), column("y_um", y_um)
+        numbers, u, y = sequence("seq", seq), column("u_V", u_V), column("y_um", y_um)
         if not numbers.size == u.size == y.size:
             raise FieldError("u_V, y_um", f"{u.size} and {y.size} values", f"{numbers.size}, as many as seq")
         if numbers.size > 1 and not (np.diff(numbers) > 0).all():
@@ -493,6 +491,13 @@ class Follower:
             step_V = change_V[0] - change_V[1]
             self._fade_V += step_V if math.isfinite(step_V) else 0.0
         self.memory, self._u_before_V = memory.copy(), float(u[-1])
+
+    def _own_memory(self, memory: ArrayLike) -> FloatArray:
+        """(m,) the memory that a caller gives. Raises FieldError where it is none of the model's."""
+        own, m = column("memory", memory, least=0), self._newest[0].model.memory_size
+        if own.size != m:
+            raise FieldError("memory", f"{own.size} values", f"{m} for model {self.name!r}")
+        return own.copy()
 
     def _corrected(self, model: InverseModel, points: Motion, std_V: float) -> float:
         """What is added to the voltages for (n,) ``points``, V."""

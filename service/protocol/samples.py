@@ -159,13 +159,22 @@ def doubles(data: bytes, offset: int, count: int) -> FloatArray:
 
 
 def number(field: str, value: float) -> float:
-    """``value`` as float. Raises InputError for a text, a list and all else that is no number."""
+    """``value`` as float. Raises InputError for a text, a list, an array and all else that is no number."""
     try:
-        if isinstance(value, str):
+        # numpy takes an array of one value for a number, with a warning.
+        if isinstance(value, str | bytes | bytearray) or np.ndim(value):
             raise TypeError(value)
         return float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FieldError(field, repr(value)[:80], "a number") from error
+
+
+def waiting_time(field: str, value: float) -> float:
+    """``value`` as a time to wait, s. Raises InputError if it is no number, or negative."""
+    seconds = number(field, value)
+    if not seconds >= 0.0:
+        raise FieldError(field, repr(value)[:80], "a time in s, not negative")
+    return seconds
 
 
 def column(field: str, values: ArrayLike, least: int = 1) -> FloatArray:

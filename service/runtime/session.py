@@ -131,7 +131,9 @@ def open_client(
     Of several endpoints (a service and its standby) it connects to the first that answers, and changes to another when
     that one fails.
     """
-    return _open_client((endpoint,) if isinstance(endpoint, str) else tuple(endpoint), wait_s, zenoh_config)
+    if isinstance(endpoint, str) or not isinstance(endpoint, Sequence) or not endpoint:
+        return _open_client((check_endpoint("endpoint", endpoint),), wait_s, zenoh_config)
+    return _open_client(endpoint, wait_s, zenoh_config)
 
 
 def _open_client(

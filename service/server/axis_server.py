@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import zenoh
 
-from service.answers.answering import trust_by_age
 from service.background.retuner import Retuner
 from service.failover.state_transfer import tell_standbys
 from service.intake.sample_queue import SampleQueue
@@ -24,7 +23,7 @@ from service.security.lease import Holders
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
-from service.server.health import Arrivals, DiskFailures, Health, SampleLosses
+from service.server.health import Arrivals, DiskFailures, Health, SampleLosses, Staleness
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, WriteRate, axis_status
@@ -106,7 +105,7 @@ class AxisServer:
             session, keys, instance, self.loop, self._latency, self._answers, self.status, deltas, authenticator
         )
         self._session = session
-        self._stale = False
+        self._staleness = Staleness(config.stale_s)
         self._losses = SampleLosses()
         self._disk_failures = DiskFailures()
         self._write_rate = WriteRate()
@@ -259,12 +258,9 @@ class AxisServer:
         age_s = self.loop.queue.age_s(now_s)
         self.axis.update_age(age_s)
         age_s = age_s or 0.0
-        config = self.axis.config
-        stale = trust_by_age(age_s, config.stale_s, config.last_good_s)[1]
-        if stale == self._stale:
+        if not self._staleness.look(age_s):
             return
-        self._stale = stale
-        if stale:
+        if self._staleness.stale:
             waiting = self.loop.queue.waiting
             why = f"{waiting} samples wait to be learnt" if waiting else "no samples come"
             detail = f"nothing is known of the last {age_s:.1f} s: {why}; answers are flagged as stale"
@@ -305,7 +301,7 @@ class AxisServer:
             role=self.role,
             epoch=self.epoch,
             synced=self.synced,
-            stale=self._stale,
+            stale=self._staleness.stale,
             losses=self._losses.trouble or self._disk_failures.trouble,
             checkpoints=self.checkpoints.counters(),
             operations=self._operations.counters(),

@@ -11,6 +11,8 @@ WINDOW_S: Final = 10.0
 _LEAST_S: Final = 2.0
 #: Least share of the samples that are learnt or passed while it is ok.
 LEAST_LEARNT: Final = 0.5
+#: What to do where samples come faster than they are learnt.
+_OUTRUN: Final = "a simulation that outruns the learner waits by client.wait_learnt(seq)"
 #: Verdicts on samples of which nothing is to be learnt: the stage rests.
 _RESTING: Final = frozenset({"learnt", "passed", "unexcited"})
 
@@ -62,7 +64,9 @@ class Health:
             lost = _lost(status) if status["trouble"] == NOT_RECORDED else ""
             return str(status["trouble"]), "; ".join(filter(None, (status.get("trouble_why"), lost, where)))
         if status["stale"]:
-            return "stale", "no samples come, or too many wait to be learnt"
+            waiting = status["samples"]["waiting"]
+            why = f"{waiting} samples wait to be learnt; {_OUTRUN}" if waiting else "no samples come"
+            return "stale", why
         if status["frozen"]:
             return "frozen", "an operator has stopped the learning"
         if not status["learning"]:
@@ -70,7 +74,7 @@ class Health:
         if not status["samples"]["received"]:
             return "no samples", "none has come since the start"
         if self._dropped:
-            return "dropping", f"{self._dropped} samples were dropped in the last {WINDOW_S:g} s: too many waited"
+            return "dropping", f"{self._dropped} dropped in the last {WINDOW_S:g} s: too many waited; {_OUTRUN}"
         if factor > 1:
             rate = "" if self.per_s is None else f" of {self.per_s:.0f} samples/s"
             return f"thinned 1/{factor}", f"the learner cannot keep up: it learns one stretch in {factor}{rate}"
@@ -79,6 +83,24 @@ class Health:
         if status["quality"].get("valid") == 0.0:
             return "unsure", "the recent error of the learning model is too large"
         return "ok", ""
+
+
+class Staleness:
+    """Whether the newest sample that was learnt is too old to answer from.
+
+    It is from ``stale_s`` on (0: never), until the age has come below half of that: the age of a learner that is just
+    behind goes up and down with every batch.
+    """
+
+    def __init__(self, stale_s: float) -> None:
+        self.stale = False
+        self._stale_s = stale_s
+
+    def look(self, age_s: float) -> bool:
+        """Take the age, s. Returns whether `stale` has changed."""
+        before = self.stale
+        self.stale = 0.0 < self._stale_s * (0.5 if before else 1.0) < age_s
+        return self.stale != before
 
 
 # --- The ways in which an axis loses the samples of its stage although they come.

@@ -105,7 +105,7 @@ def check_folder(out: Path) -> None:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error
+        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error.strerror}") from error
 
 
 def clear_output(out: Path, names: Iterable[str] = ()) -> None:

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.npy_sizes import check_npy, check_npz
 from sim.recordings.columns import ColumnMap
-from sim.recordings.matlab_process import MOST_ELEMENTS
+from sim.recordings.delimited_text import read_lines
+from sim.recordings.matlab_process import MOST_ELEMENTS, as_text
 from sim.recordings.table import MAX_BYTES, Table, plain_arrays
-from sim.recordings.text_formats import different, from_arrow, has_names, is_number, plain_number, units_row
+from sim.recordings.text_formats import from_arrow
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: MATLAB puts a text header of this length before the HDF5 data of version 7.3.
@@ -32,8 +33,6 @@ _MATLAB_4_HEADER = 20
 MATLAB_TIME_S, _MATLAB_BYTES_PER_S = 60.0, 5e6
 #: Most memory of the process that reads it: the file, its arrays, and the interpreter with scipy.
 MATLAB_MEMORY_BYTES = 3 * MAX_BYTES
-#: Rows of a sheet in which its names and first samples are looked for.
-_SHEET_HEAD = 1000
 #: Deepest nesting of groups in an HDF5 file, and most of its members: more is a loop of links.
 _DEEPEST, _MOST_MEMBERS = 16, 10_000
 
@@ -159,7 +158,7 @@ class _Hdf5:
     def _add_dataset(self, group: Any, name: str, member: Any, depth: int) -> None:
         if isinstance(member, self.h5py.Dataset) and self.h5py.check_ref_dtype(member.dtype) is self.h5py.Reference:
             self._add_elements(group, name, member, depth)
-        elif reason := self._unreadable(member):
+        elif reason := self._unreadable(name, member):
             self.left_out.append(f"{name} ({reason})")
         elif member.dtype.names is not None and not _is_complex(member.dtype):
             self._add_fields(name, member)
@@ -193,7 +192,7 @@ class _Hdf5:
             else:
                 self.left_out.append(f"{name}.{field} (no numbers)")
 
-    def _unreadable(self, member: Any) -> str:
+    def _unreadable(self, name: str, member: Any) -> str:
         """Why a member holds no array of numbers; "" where it does."""
         if not isinstance(member, self.h5py.Dataset):
             return "no array"
@@ -203,8 +202,9 @@ class _Hdf5:
         if "MATLAB_empty" in member.attrs:
             return "empty"
         if matlab and matlab not in ("double", "single", "logical") and not matlab.startswith(("int", "uint")):
-            save = ": save its columns as arrays" if "table" in matlab or matlab == "timeseries" else ""
-            return {"char": "text", "cell": "cells", "struct": "a struct array"}.get(matlab, f"a {matlab}{save}")
+            return {"char": "text", "cell": "cells", "struct": "a struct array"}.get(
+                matlab, f"a {matlab}{as_text(name)}"
+            )
         if member.dtype.kind in "fiub" or member.dtype.names is not None:
             return ""
         return "no numbers"
@@ -344,152 +344,62 @@ def _start_s(properties: Any) -> float | None:
 
 
 def read_xlsx(path: Path, content: bytes, mapping: ColumnMap) -> Table:
-    """Excel workbook: each sheet a table with a row of names, or none. Several sheets: ``sheet!column``.
+    """Excel workbook: each sheet is read as text with a line for each row. Several sheets: ``sheet!column``.
 
-    Formulas give the values that were stored with them. Charts and empty sheets are passed over.
+    Formulas give the values that were stored with them. Charts and empty sheets are passed over, sheets of remarks left
+    out.
     """
     openpyxl = _library("openpyxl", path)
     _require_unpacked_size(path, content)
+    sheets: dict[str, list[str]] = {}
     try:
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-        sheets = {}
         for sheet in book.worksheets:
             # The size that the file announces may be that of the largest sheet there can be.
             sheet.reset_dimensions()
-            sheets[sheet.title] = [list(row) for row in sheet.iter_rows(values_only=True)]
+            rows = [[_cell(value) for value in row] for row in sheet.iter_rows(values_only=True)]
+            while rows and not any(rows[-1]):  # formatted and empty
+                rows.pop()
+            width = max(map(len, rows), default=0)
+            # In one column an empty line would be no row.
+            empty = "nan" if width == 1 else ""
+            rows = [row + [""] * (width - len(row)) for row in rows]
+            sheets[sheet.title] = ["\t".join(cell or empty for cell in row) + "\n" for row in rows]
         book.close()
     except Exception as error:  # the library raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .xlsx file ({_line(error)})") from error
-    for rows in sheets.values():
-        while rows and all(cell is None for cell in rows[-1]):  # formatted and empty
-            rows.pop()
-    filled = {title: rows for title, rows in sheets.items() if rows}
-    if not filled:
-        raise InputError(f"{path}: got a workbook without values, expected one row per sample")
-    # A sheet of remarks is none of samples.
-    filled = {title: rows for title, rows in filled.items() if _number_columns(rows)} or filled
+    several = len(sheets) > 1
+    tables: dict[str, Table] = {}
+    refused: dict[str, InputError] = {}
+    for title, lines in sheets.items():
+        if any(line.strip() for line in lines):
+            try:
+                tables[title] = read_lines(f"{path}, sheet {title}" if several else str(path), lines, mapping)
+            except InputError as error:  # a sheet of remarks, as a rule
+                refused[title] = error
+    if not tables:
+        nothing = InputError(f"{path}: got a workbook without values, expected one row per sample")
+        raise next(iter(refused.values()), nothing)
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
-    notes: list[str] = []
-    for title, rows in filled.items():
-        prefix = "" if len(filled) == 1 else f"{title}!"
-        source = str(path) if len(sheets) == 1 else f"{path}, sheet {title}"
-        columns, stated, said = _sheet(source, rows, mapping)
-        plain, times = plain_arrays(columns)
-        arrays |= {prefix + name: array for name, array in plain.items()}
-        units |= {prefix + name: unit for name, unit in {**stated, **times}.items()}
-        notes += said
-    return Table(str(path), arrays, notes=tuple(notes), units=units, positional=len(filled) == 1)
+    for title, table in tables.items():
+        prefix = f"{title}!" if len(tables) > 1 else ""
+        arrays |= {prefix + name: array for name, array in table.arrays.items()}
+        units |= {prefix + name: unit for name, unit in table.units.items()}
+    notes = tuple(note for table in tables.values() for note in table.notes)
+    left_out = tuple(f"sheet {title} ({error})" for title, error in refused.items())
+    return Table(str(path), arrays, notes=notes, units=units, positional=len(tables) == 1, left_out=left_out)
 
 
-def _is_sample(cell: Any) -> bool:
-    """Whether a cell holds a number, also one that was stored as a text, or a time."""
-    if isinstance(cell, str):
-        return bool(cell.strip()) and (is_number(cell, ".") or is_number(cell, ","))
-    return cell is not None
-
-
-def _number_columns(rows: list[list[Any]]) -> list[int]:
-    """The columns of a sheet that hold numbers or times in most cells, and are as long as the others."""
-    filled = [[row[k] for row in rows if k < len(row) and row[k] is not None] for k in range(max(map(len, rows)))]
-    numbers = [sum(map(_is_sample, cells)) for cells in filled]
-    longest = max(numbers, default=0)
-    return [k for k, n in enumerate(numbers) if 2 * n > max(len(filled[k]), longest)]
-
-
-def _sheet(
-    source: str, rows: list[list[Any]], mapping: ColumnMap
-) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str]]:
-    """The columns of a sheet, their units where a row below the names states them, and what to tell the user."""
-    width = max(map(len, rows))
-    rows = [row + [None] * (width - len(row)) for row in rows]
-    while width and all(row[width - 1] is None for row in rows):
-        width -= 1
-    texts = [["" if cell is None else str(cell).strip() for cell in row[:width]] for row in rows[:_SHEET_HEAD]]
-    above, start = _names_and_start(source, rows, texts, mapping)
-    notes = []
-    if above:
-        names = different(texts[above[0]])
-        units = units_row(names, texts[above[1]]) if len(above) > 1 else {}
-        if units:
-            notes.append(f"units from row {above[1] + 1}: {', '.join(f'{n} in {u}' for n, u in units.items())}")
-        if above[0] and mapping.header is None and any(any(row) for row in texts[: above[0]]):
-            notes.append(f"columns named by row {above[0] + 1}")
-    else:
-        names, units = [str(k) for k in range(1, width + 1)], {}
-        notes.append("no names of columns in the workbook: they are called by their position, from 1")
-    stop = len(rows)
-    numbers = [k for k in _number_columns(rows[start:]) if k < width] if start < len(rows) else []
-    while numbers and stop > start and isinstance(rows[stop - 1][numbers[0]], str):
-        stop -= 1 if not _is_sample(rows[stop - 1][numbers[0]]) else stop
-    stop = stop if stop > start else len(rows)
-    if stop < len(rows):
-        notes.append(f"the last {len(rows) - stop} rows are no samples and left out: {rows[stop][numbers[0]]!r}")
-    if start >= stop:
-        raise InputError(f"{source}: got names of columns and no samples below, expected one row per sample")
-    return {name: _cells([row[k] for row in rows[start:stop]]) for k, name in enumerate(names)}, units, notes
-
-
-def _names_and_start(
-    source: str, rows: list[list[Any]], texts: list[list[str]], mapping: ColumnMap
-) -> tuple[list[int], int]:
-    """The rows of names and of units, from 0, where there are such, and the first row of samples."""
-    first = next(k for k, row in enumerate(rows) if any(cell is not None for cell in row))
-    if mapping.header not in (None, "none"):
-        first = int(str(mapping.header)) - 1
-        if first >= len(rows):
-            raise InputError(
-                f"{source}: header: got row {mapping.header}, beyond the {len(rows)} rows, expected the row of names"
-            )
-    elif mapping.header is None and (numbers := _number_columns(rows)):
-        start = next(
-            (
-                k
-                for k, row in enumerate(rows[:_SHEET_HEAD])
-                if _is_sample(row[numbers[0]]) and 2 * sum(_is_sample(row[j]) for j in numbers) > len(numbers)
-            ),
-            first,
-        )
-        named = [k for k in range(start) if all(texts[k][j] and not _is_sample(rows[k][j]) for j in numbers)]
-        if named:
-            two = len(named) > 1 and units_row(texts[named[-2]], texts[named[-1]])
-            return named[-2:] if two else named[-1:], start
-        first = start if start > first else first
-    if first < len(texts) and has_names(source, texts[first], mapping, "row", first + 1):
-        below = first + 1 < len(texts) and units_row(different(texts[first]), texts[first + 1])
-        return ([first, first + 1], first + 2) if below else ([first], first + 1)
-    return [], first
-
-
-def _cells(values: list[Any]) -> NDArray[Any]:
-    """A column of cells: numbers with NaN for empty cells, timestamps, or objects where there is a text."""
+def _cell(value: Any) -> str:
+    """A cell of a workbook as text: numbers with all their digits, times as other text has them."""
     import datetime
 
-    filled = [value for value in values if value is not None]
-    if filled and all(isinstance(value, datetime.datetime) for value in filled):
-        return np.array([np.datetime64("NaT") if value is None else value for value in values], dtype="datetime64[us]")
-    if filled and all(isinstance(value, datetime.time | datetime.timedelta) for value in filled):
-        return np.array([_microseconds(value) for value in values], dtype="timedelta64[us]")
-    if all(isinstance(value, int | float) for value in filled):
-        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    # Numbers that were stored as texts.
-    texts = [value for value in filled if not isinstance(value, int | float)]
-    for decimal in (".", ","):
-        if all(isinstance(text, str) and is_number(text, decimal) for text in texts):
-            plain = [
-                plain_number(v.replace(",", ".") if decimal == "," else v) if isinstance(v, str) else v for v in values
-            ]
-            return np.array([np.nan if value is None else float(value) for value in plain], dtype=np.float64)
-    return np.array([np.nan if value is None else value for value in values], dtype=object)
-
-
-def _microseconds(value: Any) -> Any:
-    """A time of day or a duration of a workbook, for ``timedelta64[us]``; None for an empty cell."""
-    import datetime
-
-    if isinstance(value, datetime.time):
-        return datetime.datetime.combine(datetime.date.min, value) - datetime.datetime.min
-    return value
+    if isinstance(value, bool | int | float):
+        return repr(float(value)) if isinstance(value, float) else str(int(value))
+    if isinstance(value, datetime.timedelta):
+        return f"{value.total_seconds()} sec"
+    return "" if value is None else " ".join(str(value).split())
 
 
 def _require_unpacked_size(path: Path, content: bytes) -> None:

@@ -6,6 +6,7 @@ column's name (``y_nm``). A column without any of them is refused with the optio
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Collection, Mapping
@@ -17,7 +18,12 @@ from adaptive.errors import InputError
 
 _VOLTAGE = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "kV": 1e3}
 _LENGTH = {"um": 1.0, "µm": 1.0, "μm": 1.0, "nm": 1e-3, "pm": 1e-6, "mm": 1e3, "m": 1e6}
-_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+#: To µrad, which stand in the place of µm.
+_ANGLE = {
+    "urad": 1.0, "µrad": 1.0, "μrad": 1.0, "mrad": 1e3, "rad": 1e6,
+    "arcsec": 1e6 * math.pi / 648_000, "arcmin": 1e6 * math.pi / 10_800, "deg": 1e6 * math.pi / 180,
+}  # fmt: skip
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "day": 86_400.0}
 _RATE = {"Hz": 1.0, "hz": 1.0, "kHz": 1e3}
 #: Kelvin also have an offset, which the reader subtracts.
 _TEMPERATURE = {"C": 1.0, "degC": 1.0, "K": 1.0}
@@ -41,19 +47,19 @@ _UNIT_WORDS = {
     **dict.fromkeys(("°c", "deg c", "celsius"), "C"),
     **dict.fromkeys(("kelvin",), "K"),
     **dict.fromkeys(("hertz",), "Hz"),
-    # Units of other kinds, which need a factor.
-    **{name: name for name in ("mrad", "rad", "arcsec", "arcmin", "deg", "ohm", "counts")},
-    **dict.fromkeys(("urad", "μrad"), "urad"),
+    **dict.fromkeys(("day", "days"), "day"),
     **dict.fromkeys(("degree", "degrees", "°"), "deg"),
+    # Units of other kinds, which need a factor.
+    **{name: name for name in ("ohm", "counts")},
 }
 
 #: quantity -> (canonical column, factors to its unit by unit name)
 QUANTITIES: dict[str, tuple[str, dict[str, float]]] = {
     "t": ("t_s", _TIME),
     "u": ("u_V", _VOLTAGE),
-    "y": ("y_um", _LENGTH),
+    "y": ("y_um", _LENGTH | _ANGLE),
     "u2": ("u2_V", _VOLTAGE),
-    "y2": ("y2_um", _LENGTH),
+    "y2": ("y2_um", _LENGTH | _ANGLE),
     "u3": ("u3_V", _VOLTAGE),
     "monitor": ("monitor_V", _VOLTAGE),
     "temperature": ("temperature_C", _TEMPERATURE),
@@ -74,7 +80,8 @@ class ColumnMap:
     columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 u3 monitor temperature``,
         and the scalars ``dt`` and ``rate``); in text and workbooks also its position from 1 (``"2"``), or several
         neighbours as one array (``"2:6"``).
-    units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; ``s ms us ns min``; ``C K``; ``Hz kHz``).
+    units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; angles, which become µrad: ``urad
+        mrad rad arcsec arcmin deg``; ``s ms us ns min day``; ``C K``; ``Hz kHz``).
     scale : quantity -> factor from the file's number to the canonical unit, in place of a unit, for a column in
         another quantity (10 for a sensor of 10 µm per volt).
     index : quantity -> part of an array of several dimensions, with one ``:`` for the samples (``":,0,2"``), and
@@ -238,16 +245,22 @@ def column_by_unit(quantity: str, names: list[str], units: Mapping[str, str], ta
     """The only column in a unit of the quantity: ``Voltage (V)`` is ``u`` where no other column is in volts.
 
     ``units`` : name -> unit, where the file states it apart from the name. ``taken`` : columns of other quantities.
-    None where there is no such column, or there are several.
+    None where there is no such column, or there are several. A displacement goes before an angle. The volts of a sensor
+    are not ``u`` where another column, without a unit, may be.
     """
     factors = QUANTITIES[quantity][1]
     others = {canonical for canonical, _ in QUANTITIES.values()} | set(taken)
-    found = [
-        name
-        for name in names
-        if name not in others and (unit_of_name(quantity, name) or stated_unit(units.get(name, "")) in factors)
-    ]
-    return found[0] if quantity in BY_UNIT and len(found) == 1 else None
+    free = {name: unit_of_name(quantity, name) or stated_unit(units.get(name, "")) for name in names}
+    free = {name: unit for name, unit in free.items() if name not in others and not _is_phase(name)}
+    found = [name for name, unit in free.items() if unit in _LENGTH] if quantity == "y" else []
+    found = found or [name for name, unit in free.items() if unit in factors]
+    if quantity not in BY_UNIT or len(found) != 1:
+        return None
+    if quantity == "u" and not may_be("u", found[0], free[found[0]]):
+        unnamed = [n for n, unit in free.items() if unit is None and not other_unit_of_name("u", n)]
+        if any(may_be("u", name, None) and name.casefold() not in TIME_WORDS for name in unnamed):
+            return None
+    return found[0]
 
 
 #: Names of a time, in lower case.
@@ -256,12 +269,13 @@ TIME_WORDS = ("time", "zeit", "temps", "t", "x_value", "timestamp", "x", "x-axis
 _WANTED = ("target", "command", "setpoint", "set point", "demand", "desired", "reference", "soll", "consigne")
 #: Words of a reading, which drives nothing.
 _READING = ("pos", "displ", "sensor", "weg", "auslenkung", "measured", "monitor")
-#: Words in the names of columns, for a proposal that the user checks; never used without a word from the user.
+#: Words in the names of columns, for a proposal that the user checks; never used without a word from the user. What
+#: says as little as ``ch1`` or ``input`` is none: there the column that lags is the reading.
 _WORDS = {
     "t": TIME_WORDS,
-    "u": ("volt", "drive", "command", "spannung", "tension", "piezo", "output", "ao", "dac", "ch1", "u", "1"),
-    "y": (*_READING, "input", "ai", "adc", "ch2", "y", "2"),
-}  # fmt: skip
+    "u": ("volt", "drive", "command", "spannung", "tension", "piezo", "dac"),
+    "y": (*_READING, "adc"),
+}
 
 
 def named_column(quantity: str, names: list[str]) -> str | None:
@@ -273,6 +287,16 @@ def named_column(quantity: str, names: list[str]) -> str | None:
     return None
 
 
+def _is_phase(name: str) -> bool:
+    """Whether a column is an amplifier's phase: an angle, and no tilt."""
+    return "phase" in name.casefold()
+
+
+def is_angle(unit: str) -> bool:
+    """Whether a name in `QUANTITIES` is that of an angle."""
+    return unit in _ANGLE
+
+
 def may_be(quantity: str, name: str, unit: str | None) -> bool:
     """Whether a column may be proposed for ``u`` or ``y`` by its name and the unit that it states (None for none).
 
@@ -280,8 +304,8 @@ def may_be(quantity: str, name: str, unit: str | None) -> bool:
     another kind, with a factor.
     """
     wanted, reading = (any(word in name.casefold() for word in words) for words in (_WANTED, _READING))
-    length, volts = unit in _LENGTH, unit in _VOLTAGE
-    if unit in _TIME or unit in _TEMPERATURE or unit in _RATE:
+    length, volts = unit in _LENGTH or unit in _ANGLE, unit in _VOLTAGE
+    if unit in _TIME or unit in _TEMPERATURE or unit in _RATE or _is_phase(name):
         return False
     return not wanted if quantity.startswith("y") else (volts if wanted or length else not reading)
 

@@ -6,12 +6,14 @@ pyarrow starts threads that can abort the process when it ends soon after a refu
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,37 +120,53 @@ def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
         return _read(path, "latin-1", mapping)
 
 
+def read_lines(source: str, lines: list[str], mapping: ColumnMap) -> Table:
+    """A table of cells that tabs separate, in ``lines``; ``source`` for messages. Otherwise as `read_delimited`."""
+    mapping, size = replace(mapping, delimiter="\t"), sum(map(len, lines))
+    return _read_all(source, lambda: contextlib.nullcontext(iter(lines)), size, "utf-8", mapping)
+
+
 def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
-    layout = _layout_of(path, encoding, mapping)
-    with opened(path, encoding) as file:
+    return _read_all(str(path), lambda: opened(path, encoding), path.stat().st_size, encoding, mapping)
+
+
+def _read_all(
+    source: str,
+    lines: Callable[[], AbstractContextManager[Iterator[str]]],
+    size: int,
+    encoding: str,
+    mapping: ColumnMap,
+) -> Table:
+    with lines() as head:
+        layout = _layout_of(source, head, encoding, mapping)
+    with lines() as file:
         for _ in range(layout.start):
             next(file, None)
-        rows = _Rows(path, layout, path.stat().st_size)
-        while lines := list(itertools.islice(file, _BLOCK_ROWS)):
-            rows.add(lines, last=_at_end(file, lines))
+        rows = _Rows(source, layout, size)
+        while block := list(itertools.islice(file, _BLOCK_ROWS)):
+            rows.add(block, last=_at_end(block))
     arrays, stamped = rows.arrays()
     if not rows.n:
         raise InputError(
-            f"{path}: is not a table of {len(layout.columns)} columns: the file has a header line and no samples"
+            f"{source}: is not a table of {len(layout.columns)} columns: the file has a header line and no samples"
         )
     units = {**layout.units, **dict.fromkeys(stamped, "s")}
-    return Table(str(path), arrays, dt_s=layout.dt_s, notes=(*layout.notes, *rows.notes), units=units, positional=True)
+    return Table(source, arrays, dt_s=layout.dt_s, notes=(*layout.notes, *rows.notes), units=units, positional=True)
 
 
-def _layout_of(path: Path, encoding: str, mapping: ColumnMap) -> Layout:
-    with opened(path, encoding) as file:
-        lines = list(itertools.islice(file, _HEAD_LINES))
-        try:
-            return find_layout(str(path), lines, encoding, mapping)
-        except InputError:
-            more = list(itertools.islice(file, _LONG_HEAD_LINES))
-            if not more:
-                raise
-            return find_layout(str(path), lines + more, encoding, mapping)
+def _layout_of(source: str, file: Iterator[str], encoding: str, mapping: ColumnMap) -> Layout:
+    lines = list(itertools.islice(file, _HEAD_LINES))
+    try:
+        return find_layout(source, lines, encoding, mapping)
+    except InputError:
+        more = list(itertools.islice(file, _LONG_HEAD_LINES))
+        if not more:
+            raise
+        return find_layout(source, lines + more, encoding, mapping)
 
 
-def _at_end(file: TextIO, lines: list[str]) -> bool:
-    """Whether ``lines``, just read from ``file``, are its last."""
+def _at_end(lines: list[str]) -> bool:
+    """Whether ``lines``, just read, are the last."""
     return len(lines) < _BLOCK_ROWS
 
 
@@ -312,7 +330,7 @@ def _layout(
     if named is None and names is None and not above:
         first = [split_cells(lines[start], block.delimiter)[j] for j in columns]
         if len(columns) == len(block.kinds):
-            has_names(source, first, mapping, "line", start + 1)
+            has_names(source, first, mapping, start + 1)
     preamble = _preamble(lines[: max(start, 40)], block.delimiter)
     if names is None:
         names = [str(j + 1) for j in columns]
@@ -384,9 +402,8 @@ def _names_above(
     if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
         # As pandas writes its index: the first column has no name.
         cells[0] = "index"
-    if traces := _traces(lines, block, columns, above) or _pairs(lines, block, columns, above):
-        names, units = traces
-        return names, units, [f"columns named by the preamble: {', '.join(names)}"]
+    if names := _traces(lines, block, columns, above):
+        return names, {}, [f"columns named by the preamble: {', '.join(names)}"]
     if not cells or not all(cells):
         if named := _names_and_units(lines, block, columns, above):
             return named
@@ -400,7 +417,7 @@ def _names_above(
         return cells, {}, [f"columns named by the comment above the samples: {', '.join(cells)}"]
     if any(is_number(cell, block.decimal) for cell in cells):
         if all(_is_comment(lines[k]) for k in above[:-1]):
-            has_names(source, cells, mapping, "line", last + 1)
+            has_names(source, cells, mapping, last + 1)
         return None, {}, []
     if any(_kind(cell, block.decimal) == "d" for cell in cells):
         return None, {}, []
@@ -435,33 +452,14 @@ def _names_and_units(
     return None
 
 
-def _traces(
-    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
-) -> tuple[list[str], dict[str, str]] | None:
+def _traces(lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]) -> list[str] | None:
     """The names of the columns where a line of the preamble begins with the word ``TraceName``, or Igor's ``WAVES``."""
     for k in above:
         cells = _cells_of(lines[k], block.delimiter)
         word = cells[0].casefold().partition("/")[0] if cells else ""
         if word in ("tracename", "waves") and len(cells) == len(columns) + 1:
-            return different(cells[1:]), {}
+            return different(cells[1:])
     return None
-
-
-def _pairs(
-    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
-) -> tuple[list[str], dict[str, str]] | None:
-    """Names and units of an export of TwinCAT's scope: a column of times in front of each channel's values.
-
-    Each line of the preamble has a word and a value for each channel, ``Name`` among them.
-    """
-    rows = [_cells_of(lines[k], block.delimiter) for k in above]
-    words = {row[0]: row[1::2] for row in rows if row and len(row) == len(columns) and set(row[::2]) == {row[0]}}
-    if "Name" not in words or len(columns) % 2:
-        return None
-    names = different([name for channel in words["Name"] for name in (f"time of {channel}", channel)])
-    stated = {name: "ms" for name in names[::2] if "SampleTime[ms]" in words}
-    stated |= {name: unit.strip("()") for name, unit in zip(names[1::2], words.get("Unit", []), strict=False)}
-    return names, {name: unit for name, unit in stated.items() if stated_unit(unit)}
 
 
 def _rigol(
@@ -549,8 +547,8 @@ _REPEATED: Final = "the line of names comes again between the rows: read on"
 class _Rows:
     """Collects the columns of a file, block by block, in memory that grows by the size of the file."""
 
-    def __init__(self, path: Path, layout: Layout, file_bytes: int) -> None:
-        self.path, self.layout = path, layout
+    def __init__(self, source: str, layout: Layout, file_bytes: int) -> None:
+        self.source, self.layout = source, layout
         self.n = 0
         self.notes: list[str] = []
         self._line = layout.start
@@ -606,7 +604,7 @@ class _Rows:
         capacity = max(self.n + n, expected if not self.n else self._values.shape[1] * 5 // 4)
         if (self.n + n) * 8 * max(1, len(self._numbers)) > MAX_BYTES:
             raise InputError(
-                f"{self.path}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
+                f"{self.source}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
                 "leave out columns that are not needed"
             )
         grown = np.empty((len(self._numbers), capacity))
@@ -656,7 +654,7 @@ class _Rows:
                     self.notes.append(f"the last line ({k}) is cut off and left out")
                     continue
                 raise InputError(
-                    f"{self.path}: is not a table of {len(layout.columns)} columns: line {k} has {len(cells)} cells "
+                    f"{self.source}: is not a table of {len(layout.columns)} columns: line {k} has {len(cells)} cells "
                     f"({line.strip()[:60]!r}), expected {layout.width}"
                 )
             rows.append(cells)

@@ -244,7 +244,7 @@ def _driven(u_V: FloatArray, runs_of: NDArray[np.int64]) -> bool:
 
 
 def _plausible(recording: Recording, name: str, values: FloatArray) -> list[Finding]:
-    if not name.endswith(("_um", "_V")):
+    if not name.endswith(("_um", "_V")) or (name == "y_um" and recording.y_unit != "µm"):
         return []
     low, high = PLAUSIBLE_UM if name.endswith("_um") else PLAUSIBLE_V
     span = float(np.ptp(values[np.isfinite(values)]))
@@ -270,8 +270,8 @@ def _line(recording: Recording) -> list[Finding]:
     if not on_a_line(recording.u_V, recording.y_um):
         return []
     message = (
-        "y_um: a straight line of u_V within the digits of both: a target, or a copy of the voltage, expected the "
-        "sensor's reading: choose its column (--column y=...)"
+        "y_um: a straight line of u_V within the digits of both: a target, or a copy, expected the voltage and the "
+        "sensor's reading: choose the columns (--column u=... --column y=...)"
     )
     return [Finding("line", "refusal", "y_um", len(recording), (), message)]
 

@@ -38,6 +38,14 @@ def answer(content: bytes) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     return {"names": list(arrays), "left_out": left_out}, list(arrays.values())
 
 
+def as_text(name: str) -> str:
+    """What to do with a table or an object of MATLAB's, which its own library alone reads."""
+    return (
+        f": in MATLAB, writetimetable({name}, '{name}.csv') writes a file that opens; of a table writetable, of a "
+        f"timeseries timeseries2timetable({name}) first"
+    )
+
+
 def _flatten(name: str, found: Any, into: dict[str, NDArray[Any]], left_out: list[str]) -> None:
     """Add a numeric array, or those in a structure or in cells; texts, tables and objects are left out.
 
@@ -45,7 +53,7 @@ def _flatten(name: str, found: Any, into: dict[str, NDArray[Any]], left_out: lis
     """
     value = np.asarray(found)
     if type(found).__name__ in ("MatlabOpaque", "MatlabFunction"):
-        left_out.append(f"{name} (a table or an object: save its columns as arrays)")
+        left_out.append(f"{name} (a table or an object{as_text(name)})")
     elif value.dtype.names is not None and value.ndim == 0:
         for field in value.dtype.names:
             _flatten(f"{name}.{field}", value[field].item(), into, left_out)

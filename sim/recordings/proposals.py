@@ -106,8 +106,12 @@ def likely(
     name = named_column(quantity, [one.name for one in free])
     if name is not None:
         return next(one for one in free if one.name == name)
-    if quantity == "u" and len(free) > 1 and exchanged(free[0].values, free[1].values):
-        return free[1]
+    if quantity == "u" and free:
+        # Two copies of a sensor do not lag each other.
+        first = free[0].values
+        other = next((o for o in free if not on_a_line(first[:_LOOKED_AT], o.values[:_LOOKED_AT])), None)
+        if other is not None and exchanged(first, other.values):
+            return other
     return free[0] if free else None
 
 

@@ -27,6 +27,7 @@ from sim.recordings.columns import (
     column_by_unit,
     default_column,
     factor_and_unit,
+    is_angle,
 )
 from sim.recordings.proposals import (
     Candidate,
@@ -226,6 +227,8 @@ class _Reading:
         self.notes = [note for table in self.tables for note in table.notes]
         #: quantity -> name of its array in its table, for the columns that were read.
         self.names: dict[str, str] = {}
+        #: Quantities that are angles.
+        self.angles: list[str] = []
         #: Arrays that were proposed for quantities whose column is unknown.
         self._proposals: dict[str, Candidate] = {}
 
@@ -257,7 +260,8 @@ class _Reading:
         if self.mapping.sensor_late:
             named = _sensor_moved(source, named, self.mapping.sensor_late, n)
             self.notes.append(f"sensor's column moved back by {self.mapping.sensor_late} samples (sensor_late)")
-        return Recording(dt_s=dt_s, source=source, sha256=sha256, notes=tuple(self.notes), **named)  # type: ignore[arg-type]
+        unit, notes = "µrad" if "y" in self.angles else "µm", tuple(self.notes)
+        return Recording(dt_s=dt_s, source=source, sha256=sha256, notes=notes, y_unit=unit, **named)  # type: ignore[arg-type]
 
     def _name(self, quantity: str, table: Table) -> str | None:
         """The array of a quantity in its table: as the user says, by its name, or the only one that it can be."""
@@ -382,6 +386,9 @@ class _Reading:
             self.notes.append(done)
         if unit == "K":
             return values - KELVIN_AT_0_C
+        if is_angle(unit):
+            self.angles.append(quantity)
+            self.notes.append(f"{quantity} is an angle: µrad stand where µm is written")
         return values if factor == 1.0 else values * factor
 
     def _repeat(self, source: str, columns: dict[str, NDArray[Any] | None]) -> tuple[int, list[int]]:

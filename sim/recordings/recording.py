@@ -27,7 +27,7 @@ class Recording:
     u2_V, y2_um : (n,) the other axis. u3_V : (n,) voltage of a third axis or actuator.
     monitor_V : (n,) measured voltage at the actuator. temperature_C : (n,).
     seq : (n,) sequence numbers, where recorded. reason : (n,) outcome of each sample in the learner, where recorded.
-    notes : what was done to the data when it was read.
+    notes : what was done to the data when it was read. y_unit : ``µrad`` where ``y_um`` is an angle.
 
     Raises InputError where the columns differ in length or the sample time is not positive.
     """
@@ -46,6 +46,7 @@ class Recording:
     seq: NDArray[np.int64] | None = None
     reason: NDArray[np.str_] | None = None
     notes: tuple[str, ...] = ()
+    y_unit: str = "µm"
 
     def __post_init__(self) -> None:
         n = len(self.t_s)

@@ -18,8 +18,8 @@ from sim.recordings.columns import ColumnMap, is_unit
 from sim.recordings.table import Table, seconds
 
 
-def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, number: int) -> bool:
-    """Whether the first ``kind`` ("line" or "row") of a table holds names; False where it is a sample.
+def has_names(source: str, cells: list[str], mapping: ColumnMap, number: int) -> bool:
+    """Whether the first line of a table holds names; False where it is a sample.
 
     ``number`` is its number in the file. Raises InputError where it may be both.
     """
@@ -27,17 +27,17 @@ def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, numb
         return mapping.header != "none"
     filled = [cell for cell in cells if cell]
     numbers = [cell for cell in filled if is_number(cell, mapping.decimal)]
-    settle = f"add --header {number} if this {kind} holds the columns' names, or --header none if it is a sample"
+    settle = f"add --header {number} if this line holds the columns' names, or --header none if it is a sample"
     if filled and len(numbers) == len(filled):
         if numbers in ([str(k + origin) for k in range(len(cells))] for origin in (0, 1)):
             raise InputError(
-                f"{source}: got {', '.join(numbers)} in {kind} {number}, which may be names of columns or a sample: "
+                f"{source}: got {', '.join(numbers)} in line {number}, which may be names of columns or a sample: "
                 f"{settle}"
             )
         return False
     if numbers:
         raise InputError(
-            f"{source}: got names and numbers in {kind} {number} ({', '.join(filled)[:80]}), expected one of the two: "
+            f"{source}: got names and numbers in line {number} ({', '.join(filled)[:80]}), expected one of the two: "
             f"{settle}"
         )
     return True

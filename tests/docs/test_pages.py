@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -12,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from lab.cli import main
 from service.client.client import Client
 from service.config.settings import read_config
+from service.stage_node.example_files import write_examples
 
 ROOT = Path(__file__).resolve().parents[2]
 _SAVED = re.compile(r"Save as `([\w.]+)`.*?\n```(?:python|toml)\n(.*?)```", re.S)
@@ -57,6 +60,25 @@ def test_every_link_leads_to_a_file_of_the_checkout() -> None:
         if "://" not in target and not (ROOT / page).parent.joinpath(target).exists()
     ]
     assert not dead
+
+
+def test_the_servo_of_the_page_gains_by_the_model_and_makes_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_examples(tmp_path / "files")
+    files = (str(tmp_path / "files" / "recording.csv"), str(tmp_path / "stage.npz"))
+    options = ["--models", "lssvm_adaptive", "--no-pictures", "--quiet"]
+    assert main(["identify", files[0], "--out", files[1], *options]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr("sys.argv", ["servo.py", files[1], str(tmp_path / "servo.png")])
+    said = runpy.run_path(str(ROOT / "examples" / "servo.py"), run_name="__main__")
+    alone, with_model, step = capsys.readouterr().out.splitlines()
+    error_um = [float(re.search(r"mean error ([\d.]+) µm", line)[1]) for line in (alone, with_model)]  # type: ignore[index]
+    assert error_um[0] == pytest.approx(2.58, rel=0.1)
+    assert error_um[1] < 0.03
+    assert step == "step of the voltage at the switch: 0.0000 V"
+    assert said["U_MIN_V"] <= said["u_V"].min() < said["u_V"].max() <= said["U_MAX_V"]
+    assert (tmp_path / "servo.png").stat().st_size > 10_000
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="mkdocs is not installed (extra 'docs')")

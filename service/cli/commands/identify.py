@@ -105,12 +105,8 @@ def run(args: argparse.Namespace) -> int:
             f"  long recording: fits and errors use one of {every} samples, one each {dt_s * every:g} s; motion "
             f"faster than {0.1 / (dt_s * every):.0f} Hz is judged more roughly (--fit-samples)"
         )
-    whole, repairs, samples, sha256 = (
-        Stretch.of(whole_repaired, every),
-        whole_repaired.done,
-        len(recording),
-        recording.sha256,
-    )
+    whole, repairs = Stretch.of(whole_repaired, every), whole_repaired.done
+    samples, sha256, y_unit = len(recording), recording.sha256, recording.y_unit
     # A long recording takes a gigabyte, and the fits need as much.
     del recording, whole_repaired
     if args.test is not None:
@@ -156,6 +152,7 @@ def run(args: argparse.Namespace) -> int:
             "judged_on": Path(judged_on).name if args.test is not None else judged_on,
             "heldout_rmse_um": {r.name: r.score.rmse_um for r in results if r.score is not None},
             "sensor_late": args.sensor_late or 0,
+            "y_unit": y_unit,
             "fitted_from_every": every,
             "clipped": [finding.message for finding in findings if (finding.kind, finding.severity) == CLIPPED],
         },
@@ -174,6 +171,7 @@ def run(args: argparse.Namespace) -> int:
         "dt_s": dt_s,
         "range_um": float(np.ptp(train.motion[:, 0])),
         "gain_um_per_V": gain,
+        "y_unit": y_unit,
         "judged_on": judged_on,
         "findings": [finding.as_dict() for finding in findings],
         "repaired": list(repairs),
@@ -204,10 +202,12 @@ def _progress(
 
 def table(summary: dict[str, Any]) -> str:
     """The held-out errors as text."""
+    unit = summary["y_unit"]
+    in_unit = [f"{name}/{unit}" for name in ("MAE", "RMSE", "max")]
     lines = [
-        f"Free-run error of the inverse on {summary['judged_on']}, {summary['range_um']:.4g} µm range, "
-        f"{summary['gain_um_per_V']:.4g} µm/V",
-        f"{'model':<16}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}   {'MAE/µm':>8}{'RMSE/µm':>9}{'max/µm':>8}"
+        f"Free-run error of the inverse on {summary['judged_on']}, {summary['range_um']:.4g} {unit} range, "
+        f"{summary['gain_um_per_V']:.4g} {unit}/V",
+        f"{'model':<16}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}   {in_unit[0]:>8}{in_unit[1]:>9}{in_unit[2]:>8}"
         f"   {'MAE/%':>7}{'RMSE/%':>8}   {'time/s':>6}",
     ]
     for name, entry in summary["models"].items():

@@ -97,6 +97,7 @@ def _understood(recording: Recording) -> dict[str, Any]:
         "columns": list(recording.columns()),
         "u_V": _ends(recording.u_V),
         "y_um": _ends(recording.y_um),
+        "y_unit": recording.y_unit,
     }
 
 
@@ -142,7 +143,7 @@ def text(found: dict[str, Any], findings: list[Finding]) -> str:
         u_V, y_um = ("{:.4g} to {:.4g}".format(*u[name]) for name in ("u_V", "y_um"))
         lines.append(
             f"understood: {u['samples']} samples, {u['duration_s']:.4g} s at {u['rate_Hz']:.6g} Hz; u {u_V} V, "
-            f"y {y_um} µm; columns {', '.join(u['columns'])}"
+            f"y {y_um} {u['y_unit']}; columns {', '.join(u['columns'])}"
         )
         lines += [f"  {f.severity}: {f.message}" for f in findings if f.message not in found["notes"]]
     if found["missing"]:
@@ -161,14 +162,15 @@ def draw(path: Path, title: str, recording: Recording) -> None:
     from service.reports.plot_style import envelope, figure, label, line, save
     from service.viewer.colours import MEASURED, TRAINING
 
+    y_name = f"{'displacement' if recording.y_unit == 'µm' else 'angle'} y / {recording.y_unit}"
     drawn, axes = figure(2, 2, (12.0, 7.0), title, width_ratios=[1.4, 1.0])
-    for row, (values, name) in enumerate(((recording.u_V, "voltage u / V"), (recording.y_um, "displacement y / µm"))):
+    for row, (values, name) in enumerate(((recording.u_V, "voltage u / V"), (recording.y_um, y_name))):
         t_s, shown = envelope(recording.t_s, values, _POINTS)
         line(axes[row, 0], t_s, shown, color=(TRAINING, MEASURED)[row])
         label(axes[row, 0], "time / s", name, "")
     every = max(1, len(recording) // (10 * _POINTS))
     line(axes[0, 1], recording.u_V[::every], recording.y_um[::every], color=MEASURED)
-    label(axes[0, 1], "voltage u / V", "displacement y / µm", "loop")
+    label(axes[0, 1], "voltage u / V", y_name, "loop")
     steps = np.diff(recording.t_s)
     line(axes[1, 1], recording.t_s[1:][:: max(1, every)], 1e3 * steps[:: max(1, every)], color=TRAINING)
     label(axes[1, 1], "time / s", "time since the sample before / ms", "sample times")

@@ -104,6 +104,19 @@ def test_as_of_waits_for_what_is_still_being_learnt(client: Client) -> None:
         client.trajectory([40.0], as_of=first + 5000, wait_s=0.05)
 
 
+def test_a_simulation_that_outruns_the_learner_waits_for_it(client: Client) -> None:
+    """As fast as it can be: each block waits until the service has learnt the one before."""
+    first, n = next_seq(client), 400
+    for begin in range(first, first + 10 * n, n):
+        teach(client, begin, n)
+        assert client.wait_learnt(begin + n - 1, 20.0) >= begin + n - 1
+        assert client.status()["seq"] == begin + n - 1
+    before = time.monotonic()
+    with pytest.raises(BehindError, match=f"sample {first + 10 * n}.*samples must come"):
+        client.wait_learnt(first + 10 * n, 0.2)
+    assert time.monotonic() - before < 5.0
+
+
 def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -> None:
     follower = client.follow(deltas=False)
     k, until = next_seq(client), time.monotonic() + 20.0
@@ -229,6 +242,10 @@ def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> N
         ("v_um_per_s", lambda: client.point(40.0, wrong)),
         ("u_before_V", lambda: client.point(40.0, u_before_V=wrong)),
         ("as_of", lambda: client.point(40.0, as_of=wrong)),
+        ("wait_s", lambda: client.point(40.0, wait_s=wrong)),
+        ("wait_s", lambda: client.wait_learnt(0, wrong)),
+        ("wait_s", lambda: client.take_command(wrong)),
+        ("seq", lambda: client.wait_learnt(wrong)),
         ("seq", lambda: client.command(wrong, 1.0)),
         ("seq", lambda: client.reference(wrong, 1.0)),
     ):
@@ -271,8 +288,13 @@ def test_commands_and_references_arrive(client: Client) -> None:
 def test_nobody_there(free_port: int) -> None:
     with pytest.raises(SessionError, match="no answer at"):
         Client.connect(f"tcp/127.0.0.1:{free_port}")
-    with pytest.raises(InputError, match="endpoint"):
-        Client.connect("localhost")
+    for wrong in ("localhost", None, 7447, [7447], []):
+        with pytest.raises(InputError, match=r"^endpoint: got "):
+            Client.connect(wrong)  # type: ignore[arg-type]
+    for field in ("timeout_s", "wait_s", "retry_s"):
+        for wrong in ("1", None, [1.5], -1.0, float("nan")):
+            with pytest.raises(InputError, match=f"^{field}: got "):
+                Client.connect(f"tcp/127.0.0.1:{free_port}", **{field: wrong})  # type: ignore[arg-type]
 
 
 def test_a_service_that_does_not_answer_in_time(free_port: int) -> None:

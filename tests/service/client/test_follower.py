@@ -247,3 +247,44 @@ def test_samples_that_do_not_belong_together_resynchronise_nothing() -> None:
     with pytest.raises(InputError, match="rising"):
         follower.resynchronise([21, 20], [1.0, 1.0], [30.0, 31.0])
     np.testing.assert_array_equal(follower.memory, before)
+
+
+@pytest.mark.parametrize(
+    "wrong", ["40", b"40", None, [1.5], np.array([1.5]), {}, 10**400], ids=lambda value: repr(value)[:12]
+)
+def test_an_argument_of_a_follower_that_is_no_number_is_named_and_changes_nothing(wrong: Any) -> None:
+    follower = Follower(
+        Session(), None, "lssvm_adaptive", lambda: snapshot_after(make_models()["lssvm_adaptive"], 20), LIMITS
+    )  # type: ignore[arg-type]
+    before, expected = follower.memory.copy(), follower.point(40.0)
+    follower.memory = before.copy()
+    asked: list[tuple[str, Any]] = [
+        ("y_um", lambda: follower.point(wrong)),
+        ("v_um_per_s", lambda: follower.point(40.0, wrong)),
+        ("a_um_per_s2", lambda: follower.point(40.0, 0.0, wrong)),
+        ("timeout_s", lambda: follower.wait(0, wrong)),
+        ("seq", lambda: follower.wait(wrong, 0.0)),
+    ]
+    if wrong is not None:
+        asked += [
+            ("seq", lambda: follower.point(40.0, seq=wrong)),
+            ("seq", lambda: follower.trajectory([40.0], seq=wrong)),
+        ]
+    if not isinstance(wrong, list | np.ndarray | int):
+        asked += [
+            ("y_um", lambda: follower.trajectory(wrong)),
+            ("seq", lambda: follower.resynchronise(wrong, 1.0, 40.0)),
+        ]
+    asked.append(("seq", lambda: follower.resynchronise([20, 21.5], [1.0, 1.0], [40.0, 40.0])))
+    for field, ask in asked:
+        with pytest.raises(InputError, match=f"^{field}: got "):
+            ask()
+    np.testing.assert_array_equal(follower.memory, before)
+    assert follower.point(40.0) == expected
+
+
+@pytest.mark.parametrize("memory", ["40", [[1.0]], [1.0, None], [1.0]], ids=repr)
+def test_a_memory_that_does_not_fit_is_refused_by_name(memory: Any) -> None:
+    model = make_models()["lssvm_adaptive"]
+    with pytest.raises(InputError, match=r"^memory: got "):
+        Follower(Session(), None, "lssvm_adaptive", lambda: snapshot_after(model, 20), LIMITS, memory)  # type: ignore[arg-type]

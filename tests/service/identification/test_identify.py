@@ -262,3 +262,28 @@ def test_bouc_wen_is_fitted_once_where_the_beginning_is_all_it_takes(
     )  # fmt: skip
     assert len(taken) == fits
     assert max(taken) <= 1000
+
+
+def test_a_tilt_is_identified_in_microradians_and_the_model_file_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write(tmp_path / "a.parquet", made_recording(4.0), y_um="tilt")
+    arguments = [
+        str(data),
+        "--column",
+        "y=tilt",
+        "--models",
+        "linear",
+        "--no-pictures",
+        "--out",
+        str(tmp_path / "m.npz"),
+    ]
+    status, plain, _ = identify(capsys, *arguments, "--unit", "y=um")
+    assert (status, plain["y_unit"]) == (0, "µm")
+    assert main(["identify", *arguments, "--unit", "y=mrad"]) == 0
+    captured = capsys.readouterr()
+    assert f"{1e3 * plain['range_um']:.4g} µrad range" in captured.out
+    assert "MAE/µrad" in captured.out
+    assert "µm" not in captured.out
+    assert "y is an angle: µrad stand where µm is written" in captured.err
+    assert read_bundle(tmp_path / "m.npz").meta.notes["y_unit"] == "µrad"

@@ -197,7 +197,7 @@ SCOPES: dict[str, tuple[str, str, dict[str, str]]] = {
         {"FACTOR": "10"},
     ),
     "Yokogawa": (YOKOGAWA, ",{u:.6E},{v:.6E},\n", {"FACTOR": "10"}),
-    "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {}),
+    "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {"HZ": "1000"}),
     "LabVIEW's waveforms": (LABVIEW, commas("{clock}\t{u:.6f}\t{y:.6f}\n").replace(":,", ":."), {}),
     "BenchLink": (BENCHLINK, "{k},{day}:{rest:03d},{u:.5E},0,{v:.6E},0\n", {"FACTOR": "10"}),
     "a counter in place of a time": ("Sample,U (V),Y (um)\n", "{k},{u:.5f},{y:.5f}\n", {"HZ": "1000"}),
@@ -389,7 +389,7 @@ def test_a_sheet_of_dates_and_numbers_in_one_column_is_refused(tmp_path: Path) -
     mixed = [[datetime(2026, 1, 1) if k % 2 else 1.0, u, y] for k, (_, u, y) in enumerate(TABLE)]
     workbook(tmp_path / "a.xlsx", [NAMES, *mixed])
     with pytest.raises(InputError, match="expected a number"):
-        read(tmp_path / "a.xlsx")
+        read(tmp_path / "a.xlsx", ColumnMap({"t": "1", "u": "2", "y": "3"}, {"t": "s", "u": "V", "y": "um"}))
 
 
 @pytest.mark.parametrize(
@@ -431,7 +431,15 @@ PROPOSED: dict[str, tuple[str, str, tuple[str, str]]] = {
         "Target Position,Control Voltage,Current Position\n", "{k3:.3f},{u:.5f},{y:.5f}\n",
         ("Control Voltage", "Current Position"),
     ),
-    "a unit of another kind": ("t (s),U (V),Tilt (mrad)\n", "{t:.3f},{u:.5f},{v:.6f}\n", ("", "Tilt (mrad)")),
+    "a unit of another kind": ("t (s),U (V),Sensor (counts)\n", "{t:.3f},{u:.5f},{v:.6f}\n", ("", "Sensor (counts)")),
+    "the phase of an amplifier": ("t (s),U (V),Phase (deg),A\n", "{t:.3f},{u:.5f},{k3:.3f},{y:.5f}\n", ("", "A")),
+    "channels the other way round": ("t (s),ch1,ch2\n", "{t:.3f},{y:.5f},{u:.5f}\n", ("ch2", "ch1")),
+    "the plant's input and output": ("t (s),output,input\n", "{t:.3f},{y:.5f},{u:.5f}\n", ("input", "output")),
+    "two copies of a sensor": ("t (s),A,B,C\n", "{t:.3f},{y:.5f},{y:.5f},{u:.5f}\n", ("C", "A")),
+    "two copies of a sensor, with another gain": ("t (s),A,B,C\n", "{t:.3f},{y:.5f},{v:.6f},{u:.5f}\n", ("C", "A")),
+    "a sensor in volts and in um": (
+        "t (s),Sensor (V),Sensor (um),HV\n", "{t:.3f},{v:.6f},{y:.5f},{u:.5f}\n", ("HV", ""),
+    ),
     "counts": ("t (s),dac_counts,adc_counts\n", "{t:.3f},{u:.5f},{v:.6f}\n", ("dac_counts", "adc_counts")),
     "a displacement alone": ("x [s],y [m]\n", "{t:.3f},{v:.6f}\n", ("", "")),
     "a time with another name": ("Tout,A,B\n", "{t:.3f},{u:.5f},{y:.5f}\n", ("A", "B")),
@@ -455,6 +463,43 @@ def test_no_proposal_is_wrong(tmp_path: Path, name: str) -> None:
     units = [value for option, value in options if option in ("--unit", "--scale")]
     assert all(value.endswith(("=UNIT", "=FACTOR")) for value in units)
     assert ("y=FACTOR" in units) == (name in ("counts", "a unit of another kind"))
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("urad", 1.0), ("mrad", 1e3), ("rad", 1e6), ("arcsec", 4.84813681), ("deg", 17453.2925)]
+)
+def test_a_tilt_is_read_in_microradians_and_says_so(tmp_path: Path, unit: str, factor: float) -> None:
+    tilt = Y_UM / factor
+    body = "".join(f"{t:.3f},{u:.5f},{y:.12f}\n" for t, u, y in zip(T_S, U_V, tilt, strict=True))
+    (tmp_path / "a.csv").write_text(f"Time (s),Drive (V),Tilt ({unit})\n{body}")
+    recording = read(tmp_path / "a.csv")
+    assert_read(recording)
+    assert recording.y_unit == "µrad"
+    assert any("y is an angle: µrad stand where µm is written" in note for note in recording.notes)
+    (tmp_path / "b.csv").write_text(f"Time (s),Drive (V),A\n{body}")
+    assert_read(second_try(tmp_path / "b.csv", {"y=UNIT": f"y={unit}"})[0])
+
+
+def test_a_displacement_goes_before_an_angle_and_is_no_angle(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t (s),U (V),Tilt (mrad),Z (um)\n" + rows("{t:.3f},{u:.5f},{v:.6f},{y:.5f}\n"))
+    recording = read(tmp_path / "a.csv")
+    assert_read(recording)
+    assert recording.y_unit == "µm"
+    (tmp_path / "b.csv").write_text("t (s),U (V),Phase (deg)\n" + rows("{t:.3f},{u:.5f},{v:.6f}\n"))
+    with pytest.raises(MissingError) as caught:
+        read(tmp_path / "b.csv")
+    assert caught.value.options == ("--file y=FILE",)
+
+
+def test_the_days_of_a_spreadsheet_are_a_time(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    book.active.append(["Date", "Drive", "Sensor"])
+    for t, u, y in zip(T_S.tolist(), U_V.tolist(), Y_UM.tolist(), strict=True):
+        book.active.append([46_000.5 + t / 86_400, u, y])
+    book.save(tmp_path / "a.xlsx")
+    recording, tries = second_try(tmp_path / "a.xlsx", {"t=UNIT": "t=day"})
+    assert tries == 2
+    assert_read(recording)
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -537,7 +582,9 @@ def test_a_file_without_arrays_is_refused_with_what_to_do(tmp_path: Path) -> Non
         stored.attrs["MATLAB_class"] = np.bytes_("timetable")
 
     write_v73(tmp_path / "a.mat", build)
-    with pytest.raises(InputError, match=r"no arrays of numbers.*TT \(a timetable: save its columns as arrays"):
+    with pytest.raises(
+        InputError, match=r"no arrays of numbers.*TT \(a timetable: in MATLAB, writetimetable\(TT, 'TT.csv"
+    ):
         read(tmp_path / "a.mat")
 
 
@@ -553,7 +600,7 @@ EXPORTS: dict[str, tuple[int, dict[str, str]]] = {
     "10_archiver.json": (1, {}),
     "17_thousands.csv": (1, {}),
     "23_counts.csv": (2, {"FACTOR": "0.00152588", "HZ": "1000"}),
-    "25_mrad.csv": (2, {"FACTOR": "40"}),
+    "25_mrad.csv": (1, {}),
 }
 
 
@@ -566,5 +613,5 @@ def test_awkward_exports(tmp_path: Path, name: str) -> None:
     assert recording.dt_s == pytest.approx(DT_S)
     assert 90.0 < np.ptp(recording.u_V) < 96.0
     # The sensor's volts, 10 µm each, have no unit in these files.
-    factor = 10.0 if "lecroy" in name else 1.0
+    factor = 10.0 if "lecroy" in name else 80.4 / 2010.0 if "mrad" in name else 1.0
     assert 75.0 < factor * np.ptp(recording.y_um) < 83.0

@@ -19,7 +19,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
 from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
-from service.server.health import Health
+from service.server.health import Health, Staleness
 from service.server.query_answers import LatencyMeter
 from service.server.status import axis_status
 from service.storage.model_file import Bundle, BundleMeta
@@ -174,11 +174,28 @@ def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     assert health_after({"unexcited": 1000}).state(base, 1)[0] == "ok"
     refusing = health_after({"learnt": 100, "glitch": 600, "timing": 300})
     assert refusing.state(base, 1) == ("refusing", "most samples of the last 10 s are not learnt: glitch")
-    assert health_after({"learnt": 1000}, dropped=5.0).state(base, 1)[0] == "dropping"
-    assert good.state({**base, "stale": True}, 1)[0] == "stale"
+    dropping = health_after({"learnt": 1000}, dropped=5.0).state(base, 1)
+    assert dropping[0] == "dropping"
+    assert "client.wait_learnt(seq)" in dropping[1]
+    assert good.state({**base, "stale": True}, 1) == ("stale", "no samples come")
+    behind = good.state({**base, "stale": True, "samples": {**base["samples"], "waiting": 9000}}, 1)
+    assert behind[0] == "stale"
+    assert "9000 samples wait" in behind[1]
+    assert "client.wait_learnt(seq)" in behind[1]
     assert good.state({**base, "trouble": "rail"}, 1)[0] == "rail"
     assert good.state({**base, "learning": None}, 1)[0] == "not learning"
     assert good.state({**base, "quality": {"valid": 0.0}}, 1)[0] == "unsure"
+
+
+def test_a_learner_that_is_just_behind_is_stale_once() -> None:
+    staleness = Staleness(2.0)
+    ages_s = [0.5, 1.9, *[2.1, 1.7] * 20, 1.2]
+    assert [age for age in ages_s if staleness.look(age)] == [2.1]
+    assert staleness.stale
+    assert staleness.look(0.9)
+    assert not staleness.stale
+    never = Staleness(0.0)
+    assert not any(never.look(age) for age in (0.0, 5.0, 1e9))
 
 
 def test_ok_comes_back_when_the_drops_are_over(axis_loop: Make) -> None:

@@ -636,10 +636,10 @@ def test_xlsx_with_and_without_names(tmp_path: Path) -> None:
     named = ColumnMap(columns={"t": "time", "u": "drive", "y": "sensor"})
     path = write_xlsx(tmp_path / "c.xlsx", Data=[["rig 7"], ["time", "drive", "sensor"], ["s", "V", "um"], *rows])
     same(read(path, ColumnMap(columns=named.columns, header="2")))
-    with pytest.raises(InputError, match="header: got row 999"):
+    with pytest.raises(InputError, match="header: got line 999"):
         read(path, ColumnMap(header="999"))
     numbered = write_xlsx(tmp_path / "d.xlsx", Data=[[0, 1, 2], *rows])
-    with pytest.raises(InputError, match=r"got 0, 1, 2 in row 1, .*--header none"):
+    with pytest.raises(InputError, match=r"got 0, 1, 2 in line 1, .*--header none"):
         read(numbered, BY_POSITION)
 
 
@@ -662,7 +662,7 @@ def test_xlsx_of_two_sheets_times_of_day_and_gaps(tmp_path: Path) -> None:
 def test_xlsx_that_holds_no_recording(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="workbook without values"):
         read(write_xlsx(tmp_path / "a.xlsx", Data=[]))
-    with pytest.raises(InputError, match="no samples below"):
+    with pytest.raises(InputError, match="a header line and no samples"):
         read(write_xlsx(tmp_path / "b.xlsx", Data=[["t_s", "u_V", "y_um"]]))
     with pytest.raises(InputError, match="got 'off' in data row 2, expected a number"):
         read(write_xlsx(tmp_path / "c.xlsx", Data=[["t_s", "u_V", "y_um"], [0.0, 1.0, 2.0], [1.0, "off", 3.0]]))
