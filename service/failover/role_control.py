@@ -67,38 +67,12 @@ class Claims(Tokens[Claim]):
         return self._highest_epoch + 1
 
 
-# --- Whether an instance behind routers is connected to one of them.
-#
-# An instance that loses its router sees the claims of all others disappear. It must not take over then: no client could
-# query it, and after the reconnection two instances would serve, of which the one that never failed would stand down.
+# --- Role control.
 
 #: Time from the loss of a claim until the loss of the router is known too, s; 5 ms were measured.
 _ROUTER_LOSS_KNOWN_S: Final = 0.02
 #: Time from a reconnection until the claims behind the router are known, s.
 _CLAIMS_KNOWN_S: Final = 0.5
-
-
-class Reachability:
-    """Of one session. ``behind_routers`` : others reach this instance through routers only: it listens nowhere."""
-
-    def __init__(self, session: zenoh.Session, behind_routers: bool) -> None:
-        self._session = session
-        self._behind_routers = behind_routers
-        self._unconnected_at = -_CLAIMS_KNOWN_S
-
-    def is_cut_off(self) -> bool:
-        """True if missing claims do not show that the others have failed. Takes 20 ms; do not call it in a callback."""
-        if not self._behind_routers:
-            return False
-        time.sleep(_ROUTER_LOSS_KNOWN_S)
-        now = time.monotonic()
-        if not self._session.info.routers_zid():
-            self._unconnected_at = now
-        return now - self._unconnected_at < _CLAIMS_KNOWN_S
-
-
-# --- Role control.
-
 #: Longest wait for a part of the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
@@ -120,7 +94,8 @@ class RoleControl:
     Parameters
     ----------
     server : of the axis; it listens already. search_s : time to look for a serving instance before serving, s.
-    reachability : of this instance. peer_files : checkpoints and recordings of the other instance on this host.
+    behind_routers : others reach this instance through routers only: it listens nowhere.
+    peer_files : checkpoints and recordings of the other instance on this host.
 
     Attributes
     ----------
@@ -133,7 +108,7 @@ class RoleControl:
         session: zenoh.Session,
         server: AxisServer,
         search_s: float,
-        reachability: Reachability,
+        behind_routers: bool,
         peer_files: PeerFiles,
     ) -> None:
         self.server = server
@@ -144,7 +119,8 @@ class RoleControl:
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
         self._peer_files = peer_files
-        self._reachability = reachability
+        self._behind_routers = behind_routers
+        self._unconnected_at = -_CLAIMS_KNOWN_S
         self._refusal = ""
         self._session = session
         self._search_s = search_s
@@ -241,11 +217,23 @@ class RoleControl:
         # A standby knows that the serving instance is gone; a new instance looks for one first. Without a router
         # neither is known; to find that out takes a while.
         elif (
-            (self.settled.is_set() or time.monotonic() >= until)
-            and not self._reachability.is_cut_off()
-            and claims.highest() is None
+            (self.settled.is_set() or time.monotonic() >= until) and not self._is_cut_off() and claims.highest() is None
         ):
             self._take_over()
+
+    def _is_cut_off(self) -> bool:
+        """Whether missing claims do not show that the others have failed; takes 20 ms.
+
+        An instance that loses its router sees the claims of all others disappear. It must not take over then: no client
+        could query it, and after the reconnection two would serve, of which the one that never failed would stand down.
+        """
+        if not self._behind_routers:
+            return False
+        time.sleep(_ROUTER_LOSS_KNOWN_S)
+        now = time.monotonic()
+        if not self._session.info.routers_zid():
+            self._unconnected_at = now
+        return now - self._unconnected_at < _CLAIMS_KNOWN_S
 
     def _while_alive(self, other: Claim) -> Callable[[], bool]:
         return lambda: not self._stopping and self.claims.highest() == other
@@ -254,7 +242,7 @@ class RoleControl:
         """The status of ``rival``; where it does not answer, its claim is ignored from now on."""
         server, wanted = self.server, self._while_alive(rival)
         status = status_of(self._session, server.keys.status, rival.instance, _LIFE_S, server.authenticator, wanted)
-        if status is None and wanted() and not self._reachability.is_cut_off():
+        if status is None and wanted() and not self._is_cut_off():
             self.claims.ignore(rival)
             detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer"
             server.axis.note("claim_ignored", f"{detail}: its claim is ignored")

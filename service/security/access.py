@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -248,7 +248,7 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
         path = folder / f"{name}.json5"
         listens = role in (SERVICE, ROUTER)
         if name in new:
-            config = _configuration(name, listens, _certificate(folder / "ca", name, plan.hosts, days, listens))
+            config = _configuration(folder / "ca", name, plan.hosts, days, listens)
             config["transport"]["auth"] = {"usrpwd": {"user": name, "password": passwords[name]}}
         elif listens:
             config = json.loads(path.read_text(encoding="utf-8").split("\n", 1)[1])
@@ -259,59 +259,41 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
             config["access_control"] = control
         _write(path, f"// zenoh configuration of {name}: {ROLES[role]}; holds its key, keep it secret\n{_json(config)}")
         changed.append(path)
-    manifest = {
-        "schema": _SCHEMA,
-        "users": dict(plan.users),
-        "hosts": list(plan.hosts),
-        "stages": dict(plan.stages),
-    }
-    _write(folder / MANIFEST, _json(manifest))
+    _write(folder / MANIFEST, _json({"schema": _SCHEMA, **asdict(plan)}))
     return changed
 
 
-def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str, Any]:
-    """Zenoh's settings of one user, with keys and certificates in the same file."""
-    texts = {key: base64.b64encode(pem).decode() for key, pem in pems.items()}
-    tls: dict[str, Any] = {
-        "root_ca_certificate_base64": texts["ca"],
-        "connect_certificate_base64": texts["certificate"],
-        "connect_private_key_base64": texts["key"],
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
-    if listens:
-        tls |= {"listen_certificate_base64": texts["certificate"], "listen_private_key_base64": texts["key"]}
-    return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
-
-
-def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int, listens: bool) -> dict[str, bytes]:
-    """A new key and certificate with the common name ``name``.
+def _configuration(ca: Path, name: str, hosts: Sequence[str], days: int, listens: bool) -> dict[str, Any]:
+    """Zenoh's settings of one user, with a new key and a certificate with the common name ``name`` in them.
 
     ``listens`` : valid for both ends of a connection, with the names in ``hosts``. Else for the end that connects only,
     so that nobody takes a client for the service.
     """
     named = ",".join(f"{'IP' if _is_address(host) else 'DNS'}:{host}" for host in hosts)
-    usage = (
-        f"subjectAltName={named}\nextendedKeyUsage=serverAuth,clientAuth" if listens else "extendedKeyUsage=clientAuth"
-    )
+    usage = f"serverAuth,clientAuth\nsubjectAltName={named}" if listens else "clientAuth"
+    extensions = f"basicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\nextendedKeyUsage={usage}\n"
     with tempfile.TemporaryDirectory() as scratch:
         at = Path(scratch)
-        (at / "extensions").write_text(
-            f"{usage}\nbasicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\n",
-            encoding="utf-8",
-        )
+        (at / "extensions").write_text(extensions, encoding="utf-8")
         _openssl("req", *_NEW_KEY, "-subj", f"/CN={name}", "-keyout", str(at / "key"), "-out", str(at / "request"))
         _openssl(
             "x509", "-req", "-in", str(at / "request"), "-CA", str(ca / "ca.pem"), "-CAkey", str(ca / "ca.key"),
             "-set_serial", f"0x{secrets.token_hex(16)}", "-days", str(days), "-extfile", str(at / "extensions"),
             "-out", str(at / "certificate"),
         )  # fmt: skip
-        return {
-            "ca": (ca / "ca.pem").read_bytes(),
-            "certificate": (at / "certificate").read_bytes(),
-            "key": (at / "key").read_bytes(),
-        }
+        pems = (path.read_bytes() for path in (ca / "ca.pem", at / "certificate", at / "key"))
+        root, certificate, key = (base64.b64encode(pem).decode() for pem in pems)
+    tls: dict[str, Any] = {
+        "root_ca_certificate_base64": root,
+        "connect_certificate_base64": certificate,
+        "connect_private_key_base64": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    if listens:
+        tls |= {"listen_certificate_base64": certificate, "listen_private_key_base64": key}
+    return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
 
 
 def _is_address(host: str) -> bool:

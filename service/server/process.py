@@ -17,7 +17,7 @@ import zenoh
 from threadpoolctl import threadpool_limits
 
 from service.config.settings import ServeConfig
-from service.failover.role_control import Reachability, RoleControl
+from service.failover.role_control import RoleControl
 from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
@@ -201,8 +201,7 @@ class Service:
                 )
                 self.axes.append(server)
                 _restore(server)
-                reachability = Reachability(self._session, behind_routers=not config.listen)
-                control = RoleControl(self._session, server, patience_s, reachability, peer_files)
+                control = RoleControl(self._session, server, patience_s, not config.listen, peer_files)
                 self._role_controls.append(control)
                 server.listen()
                 control.start()
