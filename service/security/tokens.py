@@ -10,15 +10,12 @@ import re
 import threading
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from typing import Any, ClassVar, Final, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import zenoh
 
 from service.protocol.keys import Keys
 from service.security.authenticator import Authenticator
-
-#: Greatest epoch that is taken for one: a take-over every second for thirty years.
-MAX_EPOCH: Final = 10**9
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -50,7 +47,7 @@ class Token:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Claim(Token):
-    """``instance`` serves since take-over number ``epoch``."""
+    """``instance`` serves since take-over number ``epoch``, at most 10^9: one every second for thirty years."""
 
     KIND: ClassVar[str] = "claim"
     FORM: ClassVar[str] = "([0-9]{1,9}|10{9})/([a-z][a-z0-9_-]{0,63})"
