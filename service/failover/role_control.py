@@ -130,7 +130,6 @@ class RoleControl:
         #: The last *freeze* or *thaw* of the one that serves, and by whom, until a state from it includes it.
         self._switch: tuple[str, str] | None = None
         self._token: Any = None
-        self._epoch = 0
         self._rival_at: float | None = None
         self._queryable: Any = None
         # Not a daemon: zenoh's callback threads inherit this from the thread that declares them, here the one that
@@ -205,7 +204,7 @@ class RoleControl:
         server.claims_refused = claims.refused
         highest = claims.highest()
         if server.role == PRIMARY:
-            if highest is None or highest < Claim(self._epoch, server.instance):
+            if highest is None or highest < Claim(server.epoch, server.instance):
                 self._check_rival(highest)
             elif self._status_of(highest) is not None:  # who does not answer queries is no successor
                 self._stand_down(highest)
@@ -275,14 +274,14 @@ class RoleControl:
         elif now - self._rival_at >= _CLAIM_LOST_S:
             self._rival_at = now
             self._claim()
-            detail = f"as number {self._epoch}: {rival.instance} serves as number {rival.epoch} and does not stand down"
-            self.server.axis.note("claimed_anew", detail)
+            detail = f"{rival.instance} serves as number {rival.epoch} and does not stand down"
+            self.server.axis.note("claimed_anew", f"as number {self.server.epoch}: {detail}")
 
     def _claim(self) -> None:
         """Declare a claim above all known ones, then withdraw the previous one."""
         server, before = self.server, self._token
-        self._epoch = server.epoch = max(self._epoch + 1, self.claims.next_epoch())
-        claim = Claim(self._epoch, server.instance)
+        server.epoch = max(server.epoch + 1, self.claims.next_epoch())
+        claim = Claim(server.epoch, server.instance)
         self._token = self._session.liveliness().declare_token(claim.key(server.authenticator, server.keys))
         if before is not None:
             before.undeclare()
@@ -326,14 +325,14 @@ class RoleControl:
     def _leave_standby(self) -> None:
         axis, stage = self.server.axis, self.server.keys.stage
         # In the first epoch there is no other state to take over: continue from its own.
-        files = self._peer_files if self._epoch > 1 else PeerFiles()
+        files = self._peer_files if self.server.epoch > 1 else PeerFiles()
         source = self.model.take_over(lambda newest_seq: restore_from_peer(axis, files, stage, newest_seq))
         self._apply_switch()  # once more: another state may have been restored
         self._switch = None
         self.server.loop.set_gate(None)
-        if self._epoch > 1:
+        if self.server.epoch > 1:
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"
-            axis.note("took_over", f"as number {self._epoch}, {model}", synced=not source)
+            axis.note("took_over", f"as number {self.server.epoch}, {model}", synced=not source)
 
     def _enter_standby(self) -> None:
         self.model.stand_down()
