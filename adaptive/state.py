@@ -307,7 +307,7 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
         elif slot.kind in ("array", "arrays", "values"):
             values[slot.field] = _sequence(slot, _leaf(parts, name), sizes, bound)
         elif slot.kind == "named":
-            given_names = slot.entry.among or tuple(parts.get(name, ()))
+            given_names = slot.entry.among or tuple(key for key in parts.get(name, ()) if key)
             below_parts = parts if not name else {key: {"": value} for key, value in parts.pop(name, {}).items()}
             with within(f"{name}." if name else ""):
                 values[slot.field] = {key: _one(slot, _leaf(below_parts, key), key) for key in given_names}

@@ -29,7 +29,7 @@ from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
 from service.protocol.keys import Keys
 from service.security.authenticator import Authenticator
-from service.security.lease import read_token
+from service.security.tokens import Holder
 from service.stage_node.faults import decode_fault
 from service.storage import checkpoint
 
@@ -124,7 +124,7 @@ def _owners() -> Target:
     keys, by = Keys("demo", "x"), Authenticator(b"0123456789abcdef")
 
     def target(data: bytes) -> None:
-        if read_token(by, keys, f"{keys.base}/owner/{data.decode(errors='replace')}") is not None:
+        if Holder.read(by, keys, f"{keys.base}/owner/{data.decode(errors='replace')}") is not None:
             raise AssertionError("a token without a tag was believed")
 
     return target

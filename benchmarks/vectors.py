@@ -552,7 +552,7 @@ def authenticators() -> list[str]:
         ("change", "put", keys.champion_delta, SERVICE, "", b"", "-", change),
         ("samples", "put", keys.sample, STAGE, "", b"", "-", "samples.payload"),
         ("state", "query", keys.state, ASKED, "pause_s=0.001", b"", "-", "-"),
-        ("claim", "claim", keys.claim(2, "i4711-ab12cd34"), b"", "", b"", "-", "-"),
+        ("claim", "claim", keys.token("claim", "2/i4711-ab12cd34"), b"", "", b"", "-", "-"),
     )
     table = [f"# secret {SHARED.hex()}", "# case kind key stamp parameters asked_stamp asked payload tag"]
     for case, kind, key, stamp, parameters, asked_stamp, asked, payload in rows:

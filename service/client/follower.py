@@ -100,19 +100,13 @@ class Changes:
 
     def take(self, payload: bytes) -> None:
         """One message from the wire. Never raises."""
-        try:
-            message = decode_delta(payload)
-        except DehystError as error:
-            with self._lock:
-                self._refuse(error)
-            return
         with self._lock:
-            if message.model:
-                self._take_whole(message)
-            elif self._waiting is not None:
-                self._waiting.append(message)
+            try:
+                message = decode_delta(payload)
+            except DehystError as error:
+                self._refuse(error)
             else:
-                self._apply(message)
+                self._take(message)
 
     def begin(self) -> None:
         """Fetch the first model. Raises what fetching and decoding raise."""
@@ -124,32 +118,22 @@ class Changes:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_CLOSE_S)
 
-    def _take_whole(self, message: DeltaMessage) -> None:
+    def _take(self, message: DeltaMessage) -> None:
+        """Take a whole model or a change, or begin a repair."""
+        state, changed = self._state, None
         try:
-            state = FollowedState.decode(message.model)
-            if state.fingerprint != message.after:
-                self.mismatches += 1
-                self._repair()
+            if message.model:
+                after = FollowedState.decode(message.model)
+            elif self._waiting is not None:
+                self._waiting.append(message)
                 return
-            self._set(state, state.message())
-        except DehystError as error:
-            self._refuse(error)
-            return
-        self.wholes += 1
-        self.fruitless = 0
-        self._waiting = None
-
-    def _apply(self, message: DeltaMessage) -> None:
-        """Add a change to the state, or begin a repair."""
-        state = self._state
-        if state is not None and message.after == state.fingerprint:
-            return  # it is in a model that was fetched
-        if state is None or message.before != state.fingerprint:
-            self.lost += 1
-            self._repair(message)
-            return
-        try:
-            after, changed = state.applied(message)
+            elif state is None or message.before != state.fingerprint:
+                if state is None or message.after != state.fingerprint:  # else it is in a model that was fetched
+                    self.lost += 1
+                    self._repair(message)
+                return
+            else:
+                after, changed = state.applied(message)
             if after.fingerprint != message.after:
                 self.mismatches += 1
                 self._repair()
@@ -158,8 +142,8 @@ class Changes:
         except DehystError as error:
             self._refuse(error)
             return
-        self.changes += 1
-        self.fruitless = 0
+        self.wholes, self.changes = self.wholes + (changed is None), self.changes + (changed is not None)
+        self.fruitless, self._waiting = 0, None
 
     def _set(self, state: FollowedState, model: ModelMessage) -> None:
         self._took(model)
@@ -223,10 +207,7 @@ class Changes:
             self._waiting = None
             self.fruitless += 1
             for message in waiting[follows:] if follows is not None else []:
-                if self._waiting is None:
-                    self._apply(message)
-                else:
-                    self._waiting.append(message)
+                self._take(message)
             return True
 
 

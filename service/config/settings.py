@@ -17,7 +17,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO, check_name
 from service.protocol.samples import MAX_COUNT
 from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
-from service.security.check import check_reach
+from service.security.access import check_reach
 
 #: The model that learns.
 LEARN = "lssvm_adaptive"

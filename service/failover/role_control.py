@@ -5,12 +5,9 @@ A thread of its own decides when claims change: callbacks of zenoh only store wh
 
 from __future__ import annotations
 
-import math
-import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import zenoh
@@ -22,129 +19,60 @@ from service.operating.server import FREEZE, THAW, Switch
 from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
 from service.protocol.keys import Keys
-from service.security.authenticator import NO_KEY, Authenticator
+from service.security.authenticator import NO_KEY, Authenticator, payload_of
+from service.security.tokens import Claim, Tokens
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 # --- Claims to serve an axis, and the rule that decides which instance serves.
 #
-# A serving instance holds a liveliness token with its *epoch*: one more than any epoch that it knew when it took over.
-# Of two serving instances the one with the lower epoch stands down; with equal epochs, the one with the lower name. An
+# A serving instance holds a token with its *epoch*: one more than any epoch that it knew when it took over. Of two
+# serving instances the one with the lower epoch stands down; with equal epochs, the one with the lower name. An
 # instance that was suspended therefore stands down when it returns, because its successor has the higher epoch. Clocks
-# are not compared.
+# are not compared. A token may be repeated by others after its instance has gone: it counts while that one answers.
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Claim:
-    """One claim; the greatest one has precedence."""
+class Claims(Tokens[Claim]):
+    """The claims of other instances. ``changed`` : set after every update."""
 
-    epoch: int
-    instance: str
-
-
-#: Greatest epoch that is taken for one: a take-over every second for thirty years.
-MAX_EPOCH: Final = 10**9
-_CLAIM: Final = re.compile(r"/claim/([0-9]{1,10})/([a-z][a-z0-9_-]{0,63})(?:/([0-9a-f]{1,64}))?$")
-
-
-def claim_key(by: Authenticator, keys: Keys, claim: Claim) -> str:
-    """The key of the token that claims; its tag shows that others repeat at most what was said."""
-    key = keys.claim(claim.epoch, claim.instance)
-    return keys.claim(claim.epoch, claim.instance, by.tag("claim", key).hex())
-
-
-def read_claim(by: Authenticator, keys: Keys, key: str) -> Claim | None:
-    """The claim in the key of a token; None if the key is not a claim, its epoch is out of range or its tag wrong."""
-    found = _CLAIM.search(key)
-    if found is None or int(found[1]) > MAX_EPOCH:
-        return None
-    claim = Claim(int(found[1]), found[2])
-    return None if by and key != claim_key(by, keys, claim) else claim
-
-
-class Claims:
-    """The claims of other instances that are alive. Zenoh's thread updates them, the thread of the role reads them.
-
-    Attributes
-    ----------
-    changed : set after every update. unsigned : count of claims that were ignored because they prove nothing.
-    """
-
-    def __init__(self, keys: Keys, instance: str, authenticator: Authenticator = NO_KEY) -> None:
-        self.unsigned = 0
+    def __init__(self, keys: Keys, instance: str, by: Authenticator = NO_KEY) -> None:
+        super().__init__(Claim, by, keys)
         self.changed = threading.Event()
-        self._keys, self._instance, self._by = keys, instance, authenticator
-        self._alive: set[Claim] = set()
-        self._ignored: set[Claim] = set()
+        self._instance = instance
+        self._ignored: frozenset[Claim] = frozenset()
         self._highest_epoch = 0
-        self._lock = threading.Lock()
 
-    def update(self, key: str, alive: bool) -> None:
-        """A token has appeared (``alive``) or disappeared."""
-        claim = read_claim(self._by, self._keys, key)
-        if claim is None:
-            self.unsigned += alive
-        elif claim.instance != self._instance:
-            with self._lock:
-                self._ignored.discard(claim)
-                self._highest_epoch = max(self._highest_epoch, claim.epoch)
-                (self._alive.add if alive else self._alive.discard)(claim)
+    def update(self, key: str, appeared: bool) -> None:
+        """A token has appeared or disappeared."""
+        super().update(key, appeared)
         self.changed.set()
+
+    def take(self, token: Claim, appeared: bool) -> None:
+        """Note the claim of another instance."""
+        if token.instance != self._instance:
+            super().take(token, appeared)
+            self._ignored -= {token}
+            self._highest_epoch = max(self._highest_epoch, token.epoch)
 
     def highest(self) -> Claim | None:
         """The claim with precedence among the others; None if there is none."""
-        with self._lock:
-            return max(self._alive - self._ignored, default=None)
+        return max(self.alive - self._ignored, default=None)
 
     def ignore(self, claim: Claim) -> None:
         """Ignore a claim whose instance does not answer, until its token appears anew."""
-        with self._lock:
-            self._ignored.add(claim)
+        with self._updating:
+            self._ignored |= {claim}
 
     def next_epoch(self) -> int:
         """One more than any known epoch."""
-        with self._lock:
-            return self._highest_epoch + 1
+        return self._highest_epoch + 1
 
 
-# --- Whether an instance behind routers is connected to one of them.
-#
-# An instance that loses its router sees the claims of all others disappear. It must not take over then: no client could
-# query it, and after the reconnection two instances would serve, of which the one that never failed would stand down.
+# --- Role control.
 
 #: Time from the loss of a claim until the loss of the router is known too, s; 5 ms were measured.
 _ROUTER_LOSS_KNOWN_S: Final = 0.02
 #: Time from a reconnection until the claims behind the router are known, s.
 _CLAIMS_KNOWN_S: Final = 0.5
-
-
-class Reachability:
-    """Reachability of one session.
-
-    Parameters
-    ----------
-    behind_routers : True if others reach this instance through routers only: it listens at no endpoint.
-    """
-
-    def __init__(self, session: zenoh.Session, behind_routers: bool) -> None:
-        self._session = session
-        self._behind_routers = behind_routers
-        self._unconnected_at = -_CLAIMS_KNOWN_S
-
-    def is_cut_off(self) -> bool:
-        """True if missing claims do not show that the others have failed. Takes 20 ms; do not call it in a callback."""
-        if not self._behind_routers:
-            return False
-        time.sleep(_ROUTER_LOSS_KNOWN_S)
-        now = time.monotonic()
-        if not self._session.info.routers_zid():
-            self._unconnected_at = now
-        return now - self._unconnected_at < _CLAIMS_KNOWN_S
-
-
-# --- Role control.
-
-#: Events of the serving instance after which its model no longer follows from the samples alone.
-MODEL_EVENTS: Final = frozenset({"selected", "rolled_back", "retuning_adopted"})
 #: Longest wait for a part of the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
@@ -152,11 +80,8 @@ _TRANSFER_PAUSE_S: Final = 0.3
 _CLAIM_LOST_S: Final = 2.0
 _POLL_S: Final = 1.0
 #: Longest wait for the status of an instance that claims to serve, s, and pause between two that a standby asks for, s.
-#: It believes nothing else: a liveliness token can be held by anybody, long after its instance.
 _LIFE_S: Final = 2.0
 _ASK_S: Final = 1.0
-#: Pause between two transfers of the state to a standby that has one, s: that its model differs anybody may say.
-_REFETCH_S: Final = 1.0
 _LEAST_WAIT_S: Final = 0.01
 #: Longest time for a change of role, and for restoring a received state, in the thread that handles samples, s.
 _CHANGE_S: Final = 60.0
@@ -169,7 +94,8 @@ class RoleControl:
     Parameters
     ----------
     server : of the axis; it listens already. search_s : time to look for a serving instance before serving, s.
-    reachability : of this instance. peer_files : checkpoints and recordings of the other instance on this host.
+    behind_routers : others reach this instance through routers only: it listens nowhere.
+    peer_files : checkpoints and recordings of the other instance on this host.
 
     Attributes
     ----------
@@ -182,20 +108,19 @@ class RoleControl:
         session: zenoh.Session,
         server: AxisServer,
         search_s: float,
-        reachability: Reachability,
+        behind_routers: bool,
         peer_files: PeerFiles,
     ) -> None:
         self.server = server
         self.claims = Claims(server.keys, server.instance, server.authenticator)
-        #: When the instance that serves last gave a sign of life, by ``time.monotonic``, s, and its name.
-        self._alive: tuple[str, float] = ("", 0.0)
-        #: When a state was last asked for, by ``time.monotonic``, s.
-        self._fetched_s = -math.inf
+        #: Who serves, and when it last gave a sign of life, by ``time.monotonic``, s.
+        self._alive: tuple[Claim | None, float] = (None, 0.0)
         self.model = StandbyModel(
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
         self._peer_files = peer_files
-        self._reachability = reachability
+        self._behind_routers = behind_routers
+        self._unconnected_at = -_CLAIMS_KNOWN_S
         self._refusal = ""
         self._session = session
         self._search_s = search_s
@@ -205,25 +130,20 @@ class RoleControl:
         #: The last *freeze* or *thaw* of the one that serves, and by whom, until a state from it includes it.
         self._switch: tuple[str, str] | None = None
         self._token: Any = None
-        self._epoch = 0
         self._rival_at: float | None = None
-        self._entities: list[Any] = []
+        self._queryable: Any = None
         # Not a daemon: zenoh's callback threads inherit this from the thread that declares them, here the one that
         # makes the axis serve. A daemon among them that returns from zenoh while the interpreter ends aborts it.
         self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=False)
         self.settled = threading.Event()
         self.ready = threading.Event()
-        server.set_synced(False)
+        server.synced = False
         server.loop.set_gate(self.model.gate)
 
     def start(self) -> None:
         """Look for other instances and take a role."""
-        keys = self.server.keys
-        self._entities = [
-            self._session.liveliness().declare_subscriber(keys.claim_any, self._on_claim, history=True),
-            self._session.declare_subscriber(keys.event, self._on_event),
-            self._session.declare_queryable(keys.switch, self._on_switch),
-        ]
+        self.claims.subscribe(self._session)
+        self._queryable = self._session.declare_queryable(self.server.keys.switch, self._on_switch)
         self._thread.start()
 
     def close(self) -> None:
@@ -232,47 +152,30 @@ class RoleControl:
         self.claims.changed.set()
         if self._thread.is_alive():
             self._thread.join()
-        for entity in self._entities:
-            entity.undeclare()
-        self._entities = []
+        self.claims.undeclare()
+        if self._queryable is not None:
+            self._queryable.undeclare()
+            self._queryable = None
         self._drop_claim()
 
-    def _on_claim(self, sample: zenoh.Sample) -> None:
-        self.claims.update(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-    def _on_event(self, sample: zenoh.Sample) -> None:
-        event = fields_of(sample.payload.to_bytes())
-        if event.get("instance") != self.server.instance and event.get("event") in MODEL_EVENTS:
-            self._refetch_state()
-
     def _on_switch(self, query: zenoh.Query) -> None:
-        """A freeze or thaw of the instance that serves must hold even if that one dies before its state has come."""
+        """An operator has changed the model that is served: fetch its state. A freeze or thaw must hold even if the
+        instance that serves dies before its state has come."""
         with query:
             key, by_key, highest = self.server.keys.switch, self.server.authenticator, self.claims.highest()
-            if self.server.role == PRIMARY or highest is None or query.payload is None:
+            if self.server.role == PRIMARY or highest is None or not by_key.is_asked_by_ours(query, key):
                 return  # the sender counts those who confirm
-            if not by_key.is_asked_by_ours(query, key):
+            said = fields_of(payload_of(query.payload))
+            verb, by, samples = said.get("verb"), said.get("by"), said.get("samples")
+            if said.get("instance") != highest.instance or not isinstance(by, str) or not isinstance(samples, int):
                 return
-            switch = fields_of(query.payload.to_bytes())
-            verb, by = switch.get("verb"), switch.get("by")
-            if switch.get("instance") != highest.instance or verb not in (FREEZE, THAW) or not isinstance(by, str):
-                return
-            samples = switch.get("samples")
-            if not isinstance(samples, int) or samples < self.model.state_samples:
+            if samples < self.model.state_samples:
                 return  # told again by somebody: the state that came since includes it, and what followed
-            self._switch = verb, by[:MAX_WHO]
+            if verb in (FREEZE, THAW):
+                self._switch = verb, by[:MAX_WHO]
             self._refetch_state()
-            query.reply(key, held := b"held", attachment=by_key.answered(query, key, held))
-
-    def _compare(self, status: dict[str, Any]) -> None:
-        """Compare the digest of the served model with the own one of the same sample."""
-        server = self.server
-        if not server.synced or self._outdated:
-            return  # the present model is about to be replaced
-        seq, theirs = status.get("snapshot_seq"), status.get("fingerprint")
-        if isinstance(seq, int) and isinstance(theirs, str) and server.axis.differs(seq, theirs):
-            server.axis.note("standby_differed", f"at sample {seq}; the state is fetched again")
-            self._refetch_state()
+            if verb in (FREEZE, THAW):
+                query.reply(key, held := b"held", attachment=by_key.answered(query, key, held))
 
     def _refetch_state(self) -> None:
         self._outdated = True
@@ -286,35 +189,50 @@ class RoleControl:
                 self._decide(until)
             except Exception as error:
                 self.server.axis.note("internal_error", f"standby: {type(error).__name__}: {error}")
-            highest = self.claims.highest()
-            if self.server.role == STANDBY and highest is None:
+            wait_s = _POLL_S
+            if self.server.role == STANDBY and self.claims.highest() is None:
                 wait_s = max(_LEAST_WAIT_S, until - time.monotonic())
-            else:
-                wait_s = _TRANSFER_PAUSE_S if self.server.role == STANDBY and self._outdated else _POLL_S
+            elif self.server.role == STANDBY and self._outdated:
+                wait_s = _TRANSFER_PAUSE_S
             self.claims.changed.wait(wait_s)
 
     def _decide(self, until: float) -> None:
-        self._note_unsigned()
-        highest = self.claims.highest()
-        if self.server.role == PRIMARY:
-            if highest is not None and highest > Claim(self._epoch, self.server.instance):
-                # Who does not answer queries is no successor.
-                if self._status_of(highest) is not None:
-                    self._stand_down(highest)
-            else:
+        server, claims = self.server, self.claims
+        if claims.refused and not server.claims_refused:
+            detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
+            server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
+        server.claims_refused = claims.refused
+        highest = claims.highest()
+        if server.role == PRIMARY:
+            if highest is None or highest < Claim(server.epoch, server.instance):
                 self._check_rival(highest)
-            return
-        if highest is None:
-            # A standby knows that the serving instance is gone; a new instance looks for one first. Without a router
-            # neither is known.
-            searched = self.settled.is_set() or time.monotonic() >= until
-            if searched and not self._reachability.is_cut_off() and self.claims.highest() is None:
-                self._take_over()
-            return
-        self.settled.set()
-        if self._outdated and (not self.server.synced or time.monotonic() - self._fetched_s >= _REFETCH_S):
-            self._take_state(highest)
-        self._check_alive(highest)
+            elif self._status_of(highest) is not None:  # who does not answer queries is no successor
+                self._stand_down(highest)
+        elif highest is not None:
+            self.settled.set()
+            if self._outdated:
+                self._take_state(highest)
+            self._compare(highest)
+        # A standby knows that the serving instance is gone; a new instance looks for one first. Without a router
+        # neither is known; to find that out takes a while.
+        elif (
+            (self.settled.is_set() or time.monotonic() >= until) and not self._is_cut_off() and claims.highest() is None
+        ):
+            self._take_over()
+
+    def _is_cut_off(self) -> bool:
+        """Whether missing claims do not show that the others have failed; takes 20 ms.
+
+        An instance that loses its router sees the claims of all others disappear. It must not take over then: no client
+        could query it, and after the reconnection two would serve, of which the one that never failed would stand down.
+        """
+        if not self._behind_routers:
+            return False
+        time.sleep(_ROUTER_LOSS_KNOWN_S)
+        now = time.monotonic()
+        if not self._session.info.routers_zid():
+            self._unconnected_at = now
+        return now - self._unconnected_at < _CLAIMS_KNOWN_S
 
     def _while_alive(self, other: Claim) -> Callable[[], bool]:
         return lambda: not self._stopping and self.claims.highest() == other
@@ -323,28 +241,26 @@ class RoleControl:
         """The status of ``rival``; where it does not answer, its claim is ignored from now on."""
         server, wanted = self.server, self._while_alive(rival)
         status = status_of(self._session, server.keys.status, rival.instance, _LIFE_S, server.authenticator, wanted)
-        if status is not None or not wanted() or self._reachability.is_cut_off():
-            return status
-        self.claims.ignore(rival)
-        detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer: its claim is ignored"
-        server.axis.note("claim_ignored", detail)
-        return None
+        if status is None and wanted() and not self._is_cut_off():
+            self.claims.ignore(rival)
+            detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer"
+            server.axis.note("claim_ignored", f"{detail}: its claim is ignored")
+        return status
 
-    def _check_alive(self, highest: Claim) -> None:
-        """Ask the instance that serves for its status: its claim may be told by somebody else, long after it."""
-        now = time.monotonic()
-        if self._alive[0] != highest.instance:
-            self._alive = (highest.instance, now)
-        elif now - self._alive[1] > _ASK_S and (status := self._status_of(highest)) is not None:
-            self._alive = (highest.instance, time.monotonic())
-            self._compare(status)
-
-    def _note_unsigned(self) -> None:
-        """Note the first claim that proves nothing; the others are counted."""
-        if self.claims.unsigned and not self.server.claims_refused:
-            detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
-            self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
-        self.server.set_claims_refused(self.claims.unsigned)
+    def _compare(self, highest: Claim) -> None:
+        """Once in a while, ask the instance that serves: whether it is there, and for the digest of its model."""
+        axis, now = self.server.axis, time.monotonic()
+        if self._alive[0] != highest:
+            self._alive = (highest, now)
+        if now - self._alive[1] <= _ASK_S or (status := self._status_of(highest)) is None:
+            return
+        self._alive = (highest, time.monotonic())
+        seq, theirs = status.get("snapshot_seq"), status.get("fingerprint")
+        if self._outdated or not (self.server.synced and isinstance(seq, int) and isinstance(theirs, str)):
+            return
+        if axis.differs(seq, theirs):
+            axis.note("standby_differed", f"at sample {seq}; the state is fetched again")
+            self._refetch_state()
 
     def _check_rival(self, rival: Claim | None) -> None:
         """Claim again if a rival with a lower claim goes on serving.
@@ -353,25 +269,29 @@ class RoleControl:
         It does deliver a new claim.
         """
         now = time.monotonic()
-        if rival is None:
-            self._rival_at = None
-        elif self._rival_at is None:
-            self._rival_at = now
+        if rival is None or self._rival_at is None:
+            self._rival_at = None if rival is None else now
         elif now - self._rival_at >= _CLAIM_LOST_S:
             self._rival_at = now
             self._claim()
-            detail = f"as number {self._epoch}: {rival.instance} serves as number {rival.epoch} and does not stand down"
-            self.server.axis.note("claimed_anew", detail)
+            detail = f"{rival.instance} serves as number {rival.epoch} and does not stand down"
+            self.server.axis.note("claimed_anew", f"as number {self.server.epoch}: {detail}")
 
     def _claim(self) -> None:
         """Declare a claim above all known ones, then withdraw the previous one."""
         server, before = self.server, self._token
-        self._epoch = max(self._epoch + 1, self.claims.next_epoch())
-        server.set_epoch(self._epoch)
-        key = claim_key(server.authenticator, server.keys, Claim(self._epoch, server.instance))
-        self._token = self._session.liveliness().declare_token(key)
+        server.epoch = max(server.epoch + 1, self.claims.next_epoch())
+        claim = Claim(server.epoch, server.instance)
+        self._token = self._session.liveliness().declare_token(claim.key(server.authenticator, server.keys))
         if before is not None:
             before.undeclare()
+
+    def _drop_claim(self) -> None:
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
+
+    # ---- changes of the role
 
     def _take_over(self) -> None:
         server = self.server
@@ -381,7 +301,7 @@ class RoleControl:
         server.serve()
         server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
-        server.set_synced(True)
+        server.synced = True
         self.settled.set()
         self.ready.set()
 
@@ -389,7 +309,7 @@ class RoleControl:
         server = self.server
         server.axis.note("stood_down", f"{other.instance} serves: it took over while this instance was unreachable")
         # First: the status must not claim that this is the served model.
-        server.set_synced(False)
+        server.synced = False
         server.stand_down()
         self._drop_claim()
         self._rival_at = None
@@ -403,18 +323,16 @@ class RoleControl:
             Switch(verb, by, 0, 0.0).apply(self.server.axis)
 
     def _leave_standby(self) -> None:
-        axis = self.server.axis
+        axis, stage = self.server.axis, self.server.keys.stage
         # In the first epoch there is no other state to take over: continue from its own.
-        source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
+        files = self._peer_files if self.server.epoch > 1 else PeerFiles()
+        source = self.model.take_over(lambda newest_seq: restore_from_peer(axis, files, stage, newest_seq))
         self._apply_switch()  # once more: another state may have been restored
         self._switch = None
         self.server.loop.set_gate(None)
-        if self._epoch > 1:
+        if self.server.epoch > 1:
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"
-            axis.note("took_over", f"as number {self._epoch}, {model}", synced=not source)
-
-    def _restore(self, newest_seq: int) -> str:
-        return restore_from_peer(self.server.axis, self._peer_files, self.server.keys.stage, newest_seq)
+            axis.note("took_over", f"as number {self.server.epoch}, {model}", synced=not source)
 
     def _enter_standby(self) -> None:
         self.model.stand_down()
@@ -423,22 +341,15 @@ class RoleControl:
 
     def _take_state(self, serving: Claim) -> None:
         """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
+        server, taken = self.server, False
         self._outdated = False  # a callback may set it again meanwhile
-        taken = False
         try:
-            taken = self._fetch_and_restore(serving)
-        finally:
-            self._outdated = self._outdated or not taken
-
-    def _fetch_and_restore(self, serving: Claim) -> bool:
-        self._fetched_s = time.monotonic()
-        server = self.server
-        try:
-            key, wanted = server.keys.state, self._while_alive(serving)
-            data = fetch_state(self._session, key, _TRANSFER_S, server.authenticator, wanted)
+            wanted = self._while_alive(serving)
+            data = fetch_state(self._session, server.keys.state, _TRANSFER_S, server.authenticator, wanted)
             if data is None:
-                return False
+                return
             server.loop.queue.call(lambda: self.model.take_state(data), _RESTORE_S)
+            taken = True
         except DehystError as error:
             refusal = f"the state of the serving instance: {error}"
             if refusal != self._refusal:
@@ -447,15 +358,12 @@ class RoleControl:
             if isinstance(error, ModelFileError):
                 # Another configuration: this instance stays without the served model, and records samples.
                 self.ready.set()
-            return False
+            return
+        finally:
+            if not taken:
+                self._outdated = True
         if not self._outdated:  # no verb came while it was sent
             self._switch = None
         self._refusal = ""
-        server.set_synced(True)
+        server.synced = True
         self.ready.set()
-        return True
-
-    def _drop_claim(self) -> None:
-        if self._token is not None:
-            self._token.undeclare()
-            self._token = None

@@ -15,12 +15,17 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.errors import ModelFileError
 from service.operating.server import Journal
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loop import SampleSink
-from service.storage.checkpoint import CheckpointFolder, decode_checkpoint, learn_again
+from service.storage.checkpoint import (
+    CheckpointFolder,
+    CheckpointMeta,
+    decode_checkpoint,
+    learn_again,
+    restore_newest,
+)
 from service.storage.segments import rows_behind
 
 # --- Checkpoints and recordings of the other instance on the same host, from which a standby can take over.
@@ -29,8 +34,7 @@ from service.storage.segments import rows_behind
 # readable checkpoint of the two, and learns the samples in the journal behind it.
 
 _STANDBY_SUFFIX: Final = "-standby"
-#: Most checkpoints that are tried: a takeover must not take long.
-_MAX_TRIED: Final = 4
+_WHOSE: Final = " of the other instance"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +53,8 @@ def standby_folder(folder: Path | None) -> Path | None:
 def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int) -> str:
     """Restore ``axis`` from ``files`` if they reach further than its own state.
 
-    Call it in the thread that handles samples. ``newest_seq`` is the number of the newest sample that has arrived, -1
-    for none. Returns what was restored, in words; "" for nothing.
+    ``newest_seq`` : number of the newest sample that has arrived, -1 for none. Returns what was restored, in words; ""
+    for nothing.
     """
     if files.checkpoints is None:
         return ""
@@ -58,27 +62,15 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
     folder = CheckpointFolder(
         files.checkpoints, stage, config.name, axis.dt_s, axis.identified, config.checkpoints_kept
     )
-    for number in folder.numbers()[:_MAX_TRIED]:
-        try:
-            meta, state = folder.read(number)
-            rows = None if files.recordings is None else rows_behind(files.recordings, meta.samples, axis.owner)
-            last_seq = meta.seq if rows is None else int(rows.seq[-1])
-            if not _further((last_seq, meta.samples + (0 if rows is None else len(rows))), axis, newest_seq):
-                return ""
-            axis.restore(state)
-        except (ModelFileError, OSError) as error:
-            axis.note("checkpoint_refused", f"checkpoint {number} of the other instance: {error}")
-            continue
-        switch = Journal(files.recordings or files.checkpoints).last_switch()
-        if switch is not None and switch.is_in(meta):
-            switch = None
-        count = 0
-        if files.recordings is not None:
-            count = learn_again(axis, files.recordings, switch)
-        elif switch is not None:
-            switch.apply(axis)
-        return f"checkpoint {number} of the other instance, sample {meta.seq}, and {count} samples of its journal"
-    return ""
+
+    def reaches_further(meta: CheckpointMeta) -> bool:
+        rows = None if files.recordings is None else rows_behind(files.recordings, meta.samples, axis.owner)
+        last_seq, count = (meta.seq, 0) if rows is None else (int(rows.seq[-1]), len(rows))
+        return _further((last_seq, meta.samples + count), axis, newest_seq)
+
+    switch = Journal(files.recordings or files.checkpoints).last_switch()
+    number = restore_newest(axis, folder, files.recordings, switch, _WHOSE, reaches_further)
+    return "" if number is None else f"checkpoint {number}{_WHOSE} and its journal, sample {axis.handled_seq}"
 
 
 def _further(theirs: tuple[int, int], axis: Axis, newest_seq: int) -> bool:
@@ -110,7 +102,7 @@ class StandbyModel:
 
     Attributes
     ----------
-    synced : True if the axis holds the model of the serving instance. syncs : count of received states.
+    synced : True if the axis holds the model of the serving instance.
     state_samples : count of all samples that the last received state includes.
     """
 
@@ -123,7 +115,7 @@ class StandbyModel:
         on_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self.synced = False
-        self.syncs = self.state_samples = 0
+        self.state_samples = 0
         self._axis = axis
         self._sink = sink
         self._kept = kept
@@ -150,32 +142,23 @@ class StandbyModel:
             self._sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, NOT_SYNCED)
         return None
 
-    def take_state(self, data: bytes) -> int:
-        """Continue from the state of the serving instance; returns the number of its last sample.
+    def take_state(self, data: bytes) -> None:
+        """Continue from the state of the serving instance.
 
         Raises ModelFileError if the state does not match this axis, which is then unchanged.
         """
         meta, state = decode_checkpoint(data)
         axis = self._axis
         meta.refuse_unless(meta.stage, axis.config.name, axis.dt_s, axis.identified)
-        if meta.axis != axis.config.name:
-            raise ModelFileError(f"axis is {meta.axis!r}, expected {axis.config.name!r}")
         axis.restore(state)
         self.synced = True
         self._overflowed = False
-        self.syncs += 1
         self._state_seq, self.state_samples = meta.seq, meta.samples
         newer = newer_than(list(self._recent), meta.seq)
         self._check_gap(newer)
         for batch in newer:  # all of them are in the recording already
             axis.handle(batch)
         self._rebase()
-        return meta.seq
-
-    @property
-    def newest_seq(self) -> int:
-        """Number of the newest sample in memory; -1 for none."""
-        return int(self._recent[-1].seq[-1]) if self._recent else -1
 
     def take_over(self, restore: Callable[[int], str] = lambda _: "") -> str:
         """Serve from now on: without a received state, continue from the best state there is and learn the samples.
@@ -187,12 +170,13 @@ class StandbyModel:
             return ""
         self.synced = True
         axis = self._axis
-        restored = restore(self.newest_seq)
+        restored = restore(int(self._recent[-1].seq[-1]) if self._recent else -1)
         source = restored or f"its own state of sample {axis.handled_seq}"
-        if self._overflowed and not restored and axis.config.recorder is not None:
+        if self._overflowed and not restored:
             learn_again(axis, axis.config.recorder)
-        kept = list(self._recent)
-        unlearnt = newer_than(kept, axis.handled_seq) if restored or self._overflowed else kept
+        unlearnt = list(self._recent)
+        if restored or self._overflowed:
+            unlearnt = newer_than(unlearnt, axis.handled_seq)
         for batch in unlearnt:
             axis.handle(batch)
         self._overflowed = False
@@ -229,11 +213,8 @@ def newer_than(batches: list[SampleBatch], seq: int) -> list[SampleBatch]:
     for i in range(len(batches) - 1, -1, -1):
         at = np.flatnonzero(batches[i].seq == seq)
         if at.size:
-            rest = _part(batches[i], slice(int(at[-1]) + 1, None))
-            return [*([rest] if len(rest) else []), *batches[i + 1 :]]
-    parts = [_part(batch, batch.seq > seq) for batch in batches]
+            parts = [batches[i].where(np.arange(len(batches[i])) > at[-1]), *batches[i + 1 :]]
+            break
+    else:
+        parts = [batch.where(batch.seq > seq) for batch in batches]
     return [part for part in parts if len(part)]
-
-
-def _part(batch: SampleBatch, which: slice | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> SampleBatch:
-    return SampleBatch(batch.seq[which], batch.t_s[which], batch.u_V[which], batch.y_um[which])

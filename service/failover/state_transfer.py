@@ -54,29 +54,27 @@ def fetch_state(
     """
     transfer, parts, count, tries = secrets.token_hex(8), list[bytes](), 1, 0
     while len(parts) < count:
-        unsigned = refused = False
+        unsigned = False
         for reply, signed in authenticator.ask(
             session, key, timeout_s, f"transfer={transfer};part={len(parts)}", sign=True, wanted=wanted,
             congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA_LOW,
         ):  # fmt: skip
-            if signed is None:
-                # Others may refuse, or send anything: only an instance of this service is believed.
-                unsigned, refused = unsigned or reply.ok is not None, refused or reply.err is not None
+            if signed is None:  # anybody may refuse, or send anything
+                unsigned |= reply.ok is not None
                 continue
-            if len(signed.payload) < _COUNT.size or len(signed.payload) > _COUNT.size + _PART_BYTES:
+            part = signed.payload
+            n = _COUNT.unpack_from(part)[0] if _COUNT.size <= len(part) <= _COUNT.size + _PART_BYTES else 0
+            if not len(parts) < n <= _MAX_PARTS or (parts and n != count):
                 return None
-            (n,) = _COUNT.unpack_from(signed.payload)
-            if n > _MAX_PARTS or (parts and n != count):
-                return None
-            parts.append(signed.payload[_COUNT.size :])
+            parts.append(part[_COUNT.size :])
             count, tries = n, 0
             break
         else:
-            tries += 1
             if unsigned:
                 detail = "a state came from somebody who does not know the key, or is of another release"
                 raise ServiceError(f"{key}: {detail}")
-            if refused or tries == _TRIES or not wanted():
+            tries += 1
+            if tries == _TRIES or not wanted():
                 return None
             time.sleep(_PAUSE_S)
     return b"".join(parts)
@@ -85,8 +83,8 @@ def fetch_state(
 def tell_standbys(
     session: zenoh.Session, key: str, switch: bytes, timeout_s: float, authenticator: Authenticator = NO_KEY
 ) -> int:
-    """Tell the standbys of a freeze or thaw (JSON). Count of those that hold it within ``timeout_s``; 0 at once where
-    there is none."""
+    """Tell the standbys of an operator's verb (JSON). Count of those that say within ``timeout_s`` that they hold it; 0
+    at once where there is none."""
     replies = authenticator.ask(session, key, timeout_s, payload=switch, sign=True)
     return sum(signed is not None for _, signed in replies)
 

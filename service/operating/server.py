@@ -30,6 +30,8 @@ from service.storage.output import append_line
 FILE: Final = "operations.jsonl"
 FILE_BEFORE: Final = "operations.1.jsonl"
 FREEZE, THAW = "freeze", "thaw"
+#: What standbys are told of: their model changes otherwise than by samples.
+_TOLD: Final = (FREEZE, THAW, "select", "rollback")
 #: Beside the journal: a file whose room on the disk the journal takes when the disk is full, and its size, bytes.
 RESERVE: Final = ".operations-reserve"
 _RESERVE_BYTES: Final = 65_536
@@ -224,7 +226,7 @@ class OperationsServer:
     keys, instance : of the axis. verbs : the commands. journal : keeps a record of them.
     note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
     samples : count of all samples when the last command was applied.
-    tell : tells the standbys of a freeze or thaw, by whom; returns how many hold it.
+    tell : tells the standbys of a verb that changes the model, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
     authenticator : signs the answers, and tells the requests that carry the key.
@@ -314,7 +316,7 @@ class OperationsServer:
             raise
         self._counts["done"] += 1
         journaled = self._write(request, seq=seq) and self._replayed
-        standbys = self._tell(request.verb, request.who) if request.verb in (FREEZE, THAW) else 0
+        standbys = self._tell(request.verb, request.who) if request.verb in _TOLD else 0
         settled = request.verb not in self._verbs.background and self._settle()
         return answer_to(request, self._keys, self._instance, seq, journaled or settled, standbys, result)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, InverseModel, StateDict, under
-from baselines.competition.champion import INVERSE_KINDS, ChampionInverse
+from adaptive.types import FloatArray, StateDict
+from baselines.competition.champion import ChampionInverse
 from service.protocol.container import encode_body
 from service.protocol.errors import FieldError
-from service.protocol.model import ModelMessage, StandIn, assemble, check_model, pack_model
+from service.protocol.model import ModelMessage, assemble, check_model, pack_model
 from service.protocol.samples import DELTA, VERSION, check_header, check_length
 
 #: version, kind, options, number of changes, snapshot_seq, fingerprints of the model before and after
@@ -105,19 +105,18 @@ def decode_delta(data: bytes) -> DeltaMessage:
     return DeltaMessage(seq, before, after, tuple(changes))
 
 
-class _Form:
-    """What changes cannot change: names, types, texts and the shapes behind the first dimension."""
+#: What changes cannot change of a model: its JSON without values; the types of its numbers; the other values; of each
+#: array its type, the shape of a row, and whether it has rows.
+_Shape = tuple[dict[str, Any], dict[str, type], dict[str, Any], dict[str, tuple[str, tuple[int, ...], int]]]
 
-    def __init__(self, header: Mapping[str, Any], flat: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-        self.header = {key: value for key, value in header.items() if key not in ("values", "safety")}
-        #: Type of a number in the JSON: float, int or bool; by entry name.
-        self.numbers = {
-            name: type(value)
-            for name, value in flat.items()
-            if isinstance(value, float | int) and not _uncounted(name)
-        }  # fmt: skip
-        self.texts = {name: value for name, value in flat.items() if name not in self.numbers}
-        self.arrays = {name: (array.dtype.str, array.shape[1:], array.ndim) for name, array in arrays.items()}
+
+class _Form:
+    """The entries of models of one shape, in order. ``texts`` : values that are no entries."""
+
+    def __init__(self, shape: _Shape, texts: Mapping[str, Any]) -> None:
+        self.shape = shape
+        self.rest, self.numbers, _, self.arrays = shape
+        self.texts = texts
         self.names = tuple(sorted((*self.numbers, *self.arrays), key=str.encode))
         self.index = {name: i for i, name in enumerate(self.names)}
         #: CRC-32 of the names, the first word of the fingerprint's bytes.
@@ -125,28 +124,6 @@ class _Form:
         self.words = struct.Struct(f"<{len(self.names) + 1}I")
         if len(self.index) < len(self.names):
             raise FieldError("header", "a name twice", "each name once, in values or in arrays")
-        self.stand_in = {key: str(value) for key, value in _stand_in(header).items() if key != "values"}
-        self.has_safety = "safety" in header
-
-    def fits(self, header: Mapping[str, Any], flat: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bool:
-        """Whether a model of these parts has this form, in which its own ``seq`` may differ."""
-        if len(flat) != len(self.numbers) + len(self.texts) or len(arrays) != len(self.arrays):
-            return False
-        for name, value in flat.items():
-            if self.numbers.get(name) is not type(value) and (
-                name not in self.texts or (self.texts[name] != value and not _uncounted(name))
-            ):
-                return False
-        for name, array in arrays.items():
-            if self.arrays.get(name) != (array.dtype.str, array.shape[1:], array.ndim):
-                return False
-        stand_in = _stand_in(header)
-        return (
-            all(header.get(key) == value for key, value in self.header.items())
-            and self.has_safety == ("safety" in header)
-            and len(stand_in) == len(self.stand_in) + bool(stand_in)
-            and all(stand_in.get(key) == value for key, value in self.stand_in.items())
-        )
 
 
 def _uncounted(name: str) -> bool:
@@ -154,15 +131,30 @@ def _uncounted(name: str) -> bool:
     return name == "seq" or name.endswith((".seq", "/seq"))
 
 
-def _stand_in(header: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(dict(header.get("safety", {})).get("stand_in", {}))
+def _split(header: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(the JSON without values, the values by the names that they have as entries). Inverse of `_join`."""
+    rest, flat = dict(header), dict(header.get("values", {}))
+    rest["values"] = {}
+    if "safety" in rest:
+        safety = dict(rest["safety"])
+        stand_in = dict(safety.pop("stand_in", {}))
+        flat |= {_SAFETY + name: value for name, value in safety.items()}
+        flat |= {_STAND_IN + name: value for name, value in dict(stand_in.get("values", {})).items()}
+        rest["safety"] = {"stand_in": stand_in | {"values": {}}} if stand_in else {}
+    return rest, flat
 
 
-def _flat(header: Mapping[str, Any]) -> dict[str, Any]:
-    """The values in the JSON by the names that they have as entries."""
-    flat = dict(header.get("values", {}))
-    flat |= {_SAFETY + name: value for name, value in dict(header.get("safety", {})).items() if name != "stand_in"}
-    return flat | {_STAND_IN + name: value for name, value in dict(_stand_in(header).get("values", {})).items()}
+def _join(rest: Mapping[str, Any], flat: Mapping[str, Any]) -> dict[str, Any]:
+    below: dict[str, dict[str, Any]] = {_SAFETY: {}, _STAND_IN: {}, "": {}}
+    for name, value in flat.items():
+        place = next(place for place in below if name.startswith(place))
+        below[place][name.removeprefix(place)] = value
+    header = {**rest, "values": below[""]}
+    if "safety" in rest:
+        header["safety"] = below[_SAFETY]
+        if rest["safety"]:
+            header["safety"]["stand_in"] = {**rest["safety"]["stand_in"], "values": below[_STAND_IN]}
+    return header
 
 
 def doubles(value: Any) -> bytes:
@@ -197,20 +189,30 @@ class FollowedState:
         as the page says.
         """
         try:
-            flat = _flat(header)
-            form = like._form if like is not None and like._form.fits(header, flat, arrays) else None
-            form = form or _Form(header, flat, arrays)
-            data = {name: doubles(flat[name]) for name in form.numbers}
-            data |= {name: doubles(array) for name, array in arrays.items()}
+            rest, flat = _split(header)
+            numbers = {
+                name: value for name, value in flat.items() if isinstance(value, float | int) and not _uncounted(name)
+            }
+            texts = {name: value for name, value in flat.items() if name not in numbers}
+            shape = (
+                rest,
+                {name: type(value) for name, value in numbers.items()},
+                {name: None if _uncounted(name) else value for name, value in texts.items()},
+                {name: (array.dtype.str, array.shape[1:], array.ndim) for name, array in arrays.items()},
+            )
+            data = {name: doubles(value) for name, value in (*numbers.items(), *arrays.items())}
         except (ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
             raise FieldError("header", repr(error), "the JSON of a model in docs/protocol.md") from error
-        if like is None or like._form is not form:
-            return cls(form, data, [zlib.crc32(data[name]) for name in form.names], snapshot_seq)
-        old, crcs = like._data, like._crcs.copy()
-        for i, name in enumerate(form.names):
-            if data[name] != old[name]:
-                crcs[i] = zlib.crc32(data[name])
-        return cls(form, data, crcs, snapshot_seq)
+        if like is not None and like._form.shape == shape:
+            return like._with({name: new for name, new in data.items() if new != like._data[name]}, snapshot_seq)
+        form = _Form(shape, texts)
+        return cls(form, data, [zlib.crc32(data[name]) for name in form.names], snapshot_seq)
+
+    def _with(self, entries: Mapping[str, bytes], snapshot_seq: int) -> FollowedState:
+        data, crcs = {**self._data, **entries}, self._crcs.copy()
+        for name, entry in entries.items():
+            crcs[self._form.index[name]] = zlib.crc32(entry)
+        return FollowedState(self._form, data, crcs, snapshot_seq)
 
     @classmethod
     def decode(cls, payload: bytes) -> FollowedState:
@@ -234,20 +236,12 @@ class FollowedState:
 
         Names that this model does not have are left out.
         """
-        data, crcs, changes = self._data, self._crcs, []
-        for name, entry in new.items():
-            old = data.get(name)
-            if old is None or old == entry:
-                continue
-            if data is self._data:
-                data, crcs = data.copy(), crcs.copy()
-            i = self._form.index[name]
-            data[name], crcs[i] = entry, zlib.crc32(entry)
-            changes += _runs(i, old, entry)
-        if not changes:
+        entries = {name: entry for name, entry in new.items() if self._data.get(name, entry) != entry}
+        if not entries:
             return self, None
-        after = FollowedState(self._form, data, crcs, snapshot_seq)
-        return after, DeltaMessage(snapshot_seq, self.fingerprint, after.fingerprint, tuple(changes))
+        after, index = self._with(entries, snapshot_seq), self._form.index
+        runs = (run for name, entry in entries.items() for run in _runs(index[name], self._data[name], entry))
+        return after, DeltaMessage(snapshot_seq, self.fingerprint, after.fingerprint, tuple(runs))
 
     def replaced(self, new: FollowedState) -> tuple[FollowedState, DeltaMessage | None]:
         """(``new``, the message that leads there from this state): changes, or the whole model in another form.
@@ -269,30 +263,24 @@ class FollowedState:
 
         Raises InputError where a change does not fit this model. The fingerprints are the caller's to compare.
         """
-        form, data, crcs = self._form, self._data.copy(), self._crcs.copy()
-        touched: dict[str, bytearray] = {}
+        names, touched = self._form.names, dict[str, bytearray]()
         for i, (entry, size, first, run) in enumerate(message.changes):
-            if entry >= len(form.names):
-                raise FieldError(f"change[{i}].entry", entry, f"below {len(form.names)}, the entries of this model")
-            name = form.names[entry]
-            now = touched.get(name)
+            if entry >= len(names):
+                raise FieldError(f"change[{i}].entry", entry, f"below {len(names)}, the entries of this model")
+            now = touched.get(names[entry])
             if now is None:
-                now = touched[name] = bytearray(data[name])
+                now = touched[names[entry]] = bytearray(self._data[names[entry]])
             have = len(now) // 8
             if size != have:
-                self._check_size(i, name, size)
+                self._check_size(i, names[entry], size)
                 if size > have and not (first <= have and first + len(run) // 8 == size):
                     raise FieldError(f"change[{i}].first", first, f"all of the new doubles from {have} on")
                 del now[8 * size :]
             now[8 * first : 8 * first + len(run)] = run
-        for name, changed in touched.items():
-            data[name] = bytes(changed)
-            crcs[form.index[name]] = zlib.crc32(changed)
-        return FollowedState(form, data, crcs, message.snapshot_seq), set(touched)
+        return self._with({name: bytes(now) for name, now in touched.items()}, message.snapshot_seq), set(touched)
 
     def _check_size(self, i: int, name: str, size: int) -> None:
-        form = self._form
-        dtype, behind, dimensions = form.arrays.get(name, ("", (), 0))
+        dtype, behind, dimensions = self._form.arrays.get(name, ("", (), 0))
         row = int(np.prod(behind)) if dimensions else 0
         if dtype != "<f8" or row == 0 or size % row:
             raise FieldError(f"change[{i}].size", size, f"whole rows of {name!r}, an array of doubles")
@@ -300,19 +288,11 @@ class FollowedState:
     def message(self, before: ModelMessage | None = None, changed: set[str] | None = None) -> ModelMessage:
         """The model, ready to be evaluated. Raises InputError or ModelFileError if it cannot be built.
 
-        ``before``, ``changed`` : the model from which this state differs in these entries alone; the parts without any
-        are taken from it.
+        ``before``, ``changed`` : the model from which this state differs in these entries alone. Where only its linear
+        part and the memories have moved, the rest is taken from it.
         """
-        if before is not None and changed is not None:
-            moved = self._moved(before, changed)
-            if moved is not None:
-                return moved
-        header, arrays = self._parts()
-        if before is None or changed is None or self._form.header.get("kind") != "champion":
-            reuse = None if before is None or changed is None else _unchanged_stand_in(before, changed)
-            return assemble(header, arrays, self.snapshot_seq, stand_in=reuse)
-        model = _champion(header["values"] | arrays, before.model, changed)
-        return assemble(header, arrays, self.snapshot_seq, model, _unchanged_stand_in(before, changed))
+        moved = None if before is None or changed is None else self._moved(before, changed)
+        return moved or assemble(*self._parts(), self.snapshot_seq)
 
     def _moved(self, before: ModelMessage, changed: set[str]) -> ModelMessage | None:
         """The model where only its linear part and the memories have moved, at little cost; None where more has."""
@@ -353,16 +333,10 @@ class FollowedState:
 
     def _parts(self) -> tuple[dict[str, Any], StateDict]:
         """JSON and arrays, as of a payload. Raises InputError where a number is not of the type that it had."""
-        form = self._form
-        values: dict[str, Any] = {}
-        safety: dict[str, Any] = {}
-        stand_in: dict[str, Any] = {}
-        arrays: StateDict = {}
-        for name, text in form.texts.items():
-            _place(name, text, values, safety, stand_in)
+        form, flat, arrays = self._form, dict(self._form.texts), StateDict()
         for name in form.names:
             if name in form.numbers:
-                _place(name, _number(name, self._data[name], form.numbers[name]), values, safety, stand_in)
+                flat[name] = _number(name, self._data[name], form.numbers[name])
                 continue
             dtype, behind, dimensions = form.arrays[name]
             array = np.frombuffer(self._data[name], dtype="<f8")
@@ -370,12 +344,7 @@ class FollowedState:
                 array = array.astype(dtype)
             shape = ((-1, *behind) if array.size else (0, *behind)) if dimensions else ()
             arrays[name] = array.reshape(shape)
-        header: dict[str, Any] = {**form.header, "values": values}
-        if form.has_safety:
-            header["safety"] = safety
-            if form.stand_in:
-                safety["stand_in"] = {**form.stand_in, "values": stand_in}
-        return header, arrays
+        return _join(form.rest, flat), arrays
 
 
 def _number(name: str, data: bytes, kind: type) -> Any:
@@ -385,15 +354,6 @@ def _number(name: str, data: bytes, kind: type) -> Any:
     if value != value or value != int(value) or (kind is bool and value not in (0.0, 1.0)):
         raise FieldError(name, value, "a truth value, 0 or 1" if kind is bool else "a whole number")
     return kind(value)
-
-
-def _place(name: str, value: Any, values: dict[str, Any], safety: dict[str, Any], stand_in: dict[str, Any]) -> None:
-    if name.startswith(_SAFETY):
-        safety[name.removeprefix(_SAFETY)] = value
-    elif name.startswith(_STAND_IN):
-        stand_in[name.removeprefix(_STAND_IN)] = value
-    else:
-        values[name] = value
 
 
 def _runs(entry: int, old: bytes, new: bytes) -> list[Change]:
@@ -411,23 +371,3 @@ def _runs(entry: int, old: bytes, new: bytes) -> list[Change]:
         for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
             changes.append(Change(entry, size, first, new[8 * first : 8 * last + 8]))
     return changes
-
-
-def _unchanged_stand_in(before: ModelMessage, changed: set[str]) -> StandIn | None:
-    """The stand-in of ``before`` where its parameters are unchanged; its memory is replaced anyway."""
-    return None if any(name.startswith(_STAND_IN) for name in changed) else before.safety.stand_in
-
-
-def _champion(state: StateDict, before: InverseModel, changed: set[str]) -> ChampionInverse | None:
-    """The champion of ``state`` with the contestants of ``before`` that have not changed; None where they differ."""
-    names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
-    if not isinstance(before, ChampionInverse) or tuple(names) != before.names:
-        return None
-    models: Sequence[InverseModel] = [
-        old if not any(entry.startswith(f"{name}.") for entry in changed)
-        else INVERSE_KINDS[kind].from_state(under(f"{name}.", state))
-        for name, kind, old in zip(names, kinds, before.models, strict=True)
-    ]  # fmt: skip
-    return ChampionInverse(
-        before.names, tuple(models), int(state["champion"]), float(state["blend_s"]), str(state["name"])
-    )

@@ -115,24 +115,19 @@ class Keys:
     @property
     def claim_any(self) -> str:
         """Matches the claims of all instances that serve this axis."""
-        return f"{self.base}/claim/*/*/**"
+        return self.tokens("claim")
 
     def claim(self, epoch: int, instance: str, tag: str = "") -> str:
-        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence.
+        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence."""
+        return self.token("claim", f"{epoch}/{instance}", tag)
 
-        ``tag`` : of the claim, by the key of the service; "" without one.
-        """
-        key = f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
-        return f"{key}/{tag}" if tag else key
+    def tokens(self, kind: str) -> str:
+        """Matches the liveliness tokens of one kind, see `service.security.tokens`."""
+        return f"{self.base}/{kind}/**"
 
-    @property
-    def owner_any(self) -> str:
-        """Matches the tokens of all controllers of this axis."""
-        return f"{self.base}/owner/**"
-
-    def owner(self, holder: str, tag: str = "") -> str:
-        """Liveliness: a controller owns `command`; see `service.security.lease`. ``tag`` : as of a claim."""
-        key = f"{self.base}/owner/{holder}"
+    def token(self, kind: str, name: str, tag: str = "") -> str:
+        """Liveliness: a claim to serve (``claim``), or a controller (``owner``). ``tag`` : "" without a key."""
+        key = f"{self.base}/{kind}/{name}"
         return f"{key}/{tag}" if tag else key
 
     def standby(self, instance: str) -> str:

@@ -203,17 +203,8 @@ def check_model(data: bytes) -> tuple[dict[str, Any], StateDict, int]:
     return header, state, snapshot_seq
 
 
-def assemble(
-    header: dict[str, Any],
-    arrays: StateDict,
-    snapshot_seq: int,
-    model: InverseModel | None = None,
-    stand_in: StandIn | None = None,
-) -> ModelMessage:
-    """The snapshot of JSON and arrays. Raises InputError and ModelFileError as `decode_model`.
-
-    ``model``, ``stand_in`` : already built, with the same parameters; of the stand-in only the memory is taken anew.
-    """
+def assemble(header: dict[str, Any], arrays: StateDict, snapshot_seq: int) -> ModelMessage:
+    """The snapshot of JSON and arrays. Raises InputError and ModelFileError as `decode_model`."""
     state = dict(arrays)
     try:
         kind, name, values = str(header["kind"]), str(header["name"]), dict(header["values"])
@@ -221,7 +212,7 @@ def assemble(
         raise FieldError("header", repr(error), "JSON with name, kind, dt_s, values and arrays") from error
     other_state = {key.removeprefix(_STAND_IN): state.pop(key) for key in list(state) if key.startswith(_STAND_IN)}
     other_memory, memory = state.pop(_STAND_IN_MEMORY, None), state.pop(_MEMORY, None)
-    model, vector = _build(kind, name, values | state, memory, model)
+    model, vector = _build(kind, name, values | state, memory)
     try:
         entries = dict(header.get("safety", {}))
         other = entries.pop("stand_in", None)
@@ -230,8 +221,7 @@ def assemble(
         safety = Safety(**known, trouble=str(entries.get("trouble", "")))
         if other is not None:
             other_name, other_values = str(other["name"]), dict(other["values"])
-            made = None if stand_in is None else stand_in.model
-            built = _build(str(other["kind"]), other_name, other_state | other_values, other_memory, made)
+            built = _build(str(other["kind"]), other_name, other_state | other_values, other_memory)
             safety = replace(safety, stand_in=StandIn(other_name, *built))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FieldError("safety", repr(error), "the entries in docs/protocol.md") from error
@@ -240,14 +230,11 @@ def assemble(
     return ModelMessage(name, model, snapshot_seq, vector, safety)
 
 
-def _build(
-    kind: str, name: str, state: StateDict, memory: Any, model: InverseModel | None
-) -> tuple[InverseModel, FloatArray]:
+def _build(kind: str, name: str, state: StateDict, memory: Any) -> tuple[InverseModel, FloatArray]:
     if memory is None:
         raise FieldError("arrays", f"no memory of {name!r}", f"an array with the key {_MEMORY!r}")
-    if model is None:
-        with np.errstate(all="ignore"):  # numbers out of range show in the answers, which are guarded
-            model = build_model(kind, state, f"model {name!r}")
+    with np.errstate(all="ignore"):  # numbers out of range show in the answers, which are guarded
+        model = build_model(kind, state, f"model {name!r}")
     vector: FloatArray = np.asarray(memory, dtype=np.float64).reshape(-1)
     if vector.size != model.memory_size:
         raise ModelFileError(f"model {name!r}: memory of {vector.size} doubles, expected {model.memory_size}")

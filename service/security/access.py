@@ -1,6 +1,7 @@
 """Access of an installation on several hosts (docs/access.md).
 
-Rules of the roles, and the files that `create` makes: certificates, passwords, zenoh configurations.
+Rules of the roles; the files that `create` makes: certificates, passwords, zenoh configurations; and `check_reach`,
+which refuses endpoints beyond this machine whose configuration lacks what these have.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import zenoh
+
 from service.protocol.errors import FieldError, ServiceError
 from service.protocol.keys import ROOT, check_name
+from service.runtime.session import is_loopback, read_zenoh_config
 from service.storage.output import atomic_write
 
 # --- Zenoh's access control for this project: what each role may send to a service or a router (docs/access.md).
@@ -244,7 +248,7 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
         path = folder / f"{name}.json5"
         listens = role in (SERVICE, ROUTER)
         if name in new:
-            config = _configuration(name, listens, _certificate(folder / "ca", name, plan.hosts, days, listens))
+            config = _configuration(folder / "ca", name, plan.hosts, days, listens)
             config["transport"]["auth"] = {"usrpwd": {"user": name, "password": passwords[name]}}
         elif listens:
             config = json.loads(path.read_text(encoding="utf-8").split("\n", 1)[1])
@@ -255,59 +259,41 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
             config["access_control"] = control
         _write(path, f"// zenoh configuration of {name}: {ROLES[role]}; holds its key, keep it secret\n{_json(config)}")
         changed.append(path)
-    manifest = {
-        "schema": _SCHEMA,
-        "users": dict(plan.users),
-        "hosts": list(plan.hosts),
-        "stages": dict(plan.stages),
-    }
-    _write(folder / MANIFEST, _json(manifest))
+    _write(folder / MANIFEST, _json({"schema": _SCHEMA, **asdict(plan)}))
     return changed
 
 
-def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str, Any]:
-    """Zenoh's settings of one user, with keys and certificates in the same file."""
-    texts = {key: base64.b64encode(pem).decode() for key, pem in pems.items()}
-    tls: dict[str, Any] = {
-        "root_ca_certificate_base64": texts["ca"],
-        "connect_certificate_base64": texts["certificate"],
-        "connect_private_key_base64": texts["key"],
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
-    if listens:
-        tls |= {"listen_certificate_base64": texts["certificate"], "listen_private_key_base64": texts["key"]}
-    return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
-
-
-def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int, listens: bool) -> dict[str, bytes]:
-    """A new key and certificate with the common name ``name``.
+def _configuration(ca: Path, name: str, hosts: Sequence[str], days: int, listens: bool) -> dict[str, Any]:
+    """Zenoh's settings of one user, with a new key and a certificate with the common name ``name`` in them.
 
     ``listens`` : valid for both ends of a connection, with the names in ``hosts``. Else for the end that connects only,
     so that nobody takes a client for the service.
     """
     named = ",".join(f"{'IP' if _is_address(host) else 'DNS'}:{host}" for host in hosts)
-    usage = (
-        f"subjectAltName={named}\nextendedKeyUsage=serverAuth,clientAuth" if listens else "extendedKeyUsage=clientAuth"
-    )
+    usage = f"serverAuth,clientAuth\nsubjectAltName={named}" if listens else "clientAuth"
+    extensions = f"basicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\nextendedKeyUsage={usage}\n"
     with tempfile.TemporaryDirectory() as scratch:
         at = Path(scratch)
-        (at / "extensions").write_text(
-            f"{usage}\nbasicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\n",
-            encoding="utf-8",
-        )
+        (at / "extensions").write_text(extensions, encoding="utf-8")
         _openssl("req", *_NEW_KEY, "-subj", f"/CN={name}", "-keyout", str(at / "key"), "-out", str(at / "request"))
         _openssl(
             "x509", "-req", "-in", str(at / "request"), "-CA", str(ca / "ca.pem"), "-CAkey", str(ca / "ca.key"),
             "-set_serial", f"0x{secrets.token_hex(16)}", "-days", str(days), "-extfile", str(at / "extensions"),
             "-out", str(at / "certificate"),
         )  # fmt: skip
-        return {
-            "ca": (ca / "ca.pem").read_bytes(),
-            "certificate": (at / "certificate").read_bytes(),
-            "key": (at / "key").read_bytes(),
-        }
+        pems = (path.read_bytes() for path in (ca / "ca.pem", at / "certificate", at / "key"))
+        root, certificate, key = (base64.b64encode(pem).decode() for pem in pems)
+    tls: dict[str, Any] = {
+        "root_ca_certificate_base64": root,
+        "connect_certificate_base64": certificate,
+        "connect_private_key_base64": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    if listens:
+        tls |= {"listen_certificate_base64": certificate, "listen_private_key_base64": key}
+    return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
 
 
 def _is_address(host: str) -> bool:
@@ -337,3 +323,81 @@ def _write(path: Path, text: str) -> None:
     """Write atomically; only the owner can read the file at any time."""
     with atomic_write(path, mode=0o600) as file:
         file.write(text.encode())
+
+
+# --- What a configuration must have to be reached from beyond this machine.
+
+#: Links that are encrypted and know both ends by certificate.
+_SECURE_PROTOCOLS: Final = ("tls", "quic")
+ADVICE: Final = (
+    "make one with 'dehyst access init' and name it as zenoh_config, or say insecure_beyond_loopback = true "
+    "(--insecure-beyond-loopback) if all that can reach this address may do everything; see docs/access.md"
+)
+
+
+def check_reach(
+    where: str, listen: Sequence[str], connect: Sequence[str], zenoh_config: Path | None, insecure: bool = False
+) -> None:
+    """Refuse endpoints beyond this machine without mutual TLS, passwords and, to listen, access control.
+
+    Raises InputError naming ``where``, the endpoint and what is missing; SessionError where the file is not zenoh's.
+    ``insecure`` : True allows every endpoint.
+    """
+    if insecure:
+        return
+    for kind, endpoints in (("listen", listen), ("connect", connect)):
+        beyond = [endpoint for endpoint in endpoints if not is_loopback(endpoint)]
+        if not beyond:
+            continue
+        missing = missing_protection(zenoh_config, kind == "listen")
+        missing += [
+            f"{endpoint} is not one of {', '.join(_SECURE_PROTOCOLS)}"
+            for endpoint in beyond
+            if endpoint.split("/", 1)[0] not in _SECURE_PROTOCOLS
+        ]
+        if missing:
+            raise FieldError(
+                f"{where}: {kind}",
+                f"{', '.join(beyond)} with {'; '.join(missing)}",
+                "an endpoint of this machine, or zenoh's configuration with TLS, passwords and access control",
+                ADVICE,
+            )
+
+
+def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
+    """The protections that a zenoh configuration lacks; empty if it has all. Raises SessionError."""
+    if zenoh_config is None:
+        return ["no zenoh_config"]
+    config = read_zenoh_config(zenoh_config)
+    tls, auth = _section(config, "transport/link/tls"), _section(config, "transport/auth/usrpwd")
+    protocols = _section(config, "transport/link/protocols")
+    missing = []
+    if not protocols or any(protocol not in _SECURE_PROTOCOLS for protocol in protocols):
+        missing.append("transport/link/protocols not limited to tls or quic")
+    if tls.get("verify_name_on_connect") is False and not listens:
+        missing.append("verify_name_on_connect off")
+    if listens:
+        if not tls.get("enable_mtls"):
+            missing.append("no certificates asked of clients (enable_mtls)")
+        if not auth.get("dictionary_file"):
+            missing.append("no passwords asked of clients (usrpwd/dictionary_file)")
+        if not has_access_control(zenoh_config):
+            missing.append("no access control that denies by default")
+    elif not auth.get("user"):
+        missing.append("no user and password of its own (usrpwd/user)")
+    return missing
+
+
+def has_access_control(zenoh_config: Path | None) -> bool:
+    """Whether a configuration enables the access control of zenoh and denies by default."""
+    if zenoh_config is None:
+        return False
+    control = _section(read_zenoh_config(zenoh_config), "access_control")
+    return bool(control.get("enabled")) and control.get("default_permission") == "deny"
+
+
+def _section(config: zenoh.Config, key: str) -> Any:
+    try:
+        return json.loads(config.get_json(key)) or {}
+    except zenoh.ZError:
+        return {}

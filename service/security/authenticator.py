@@ -204,6 +204,27 @@ class Question:
         return Signed(payload, stamp) if right else None
 
 
+class Rising:
+    """The highest number of each of the last senders: each of their messages counts once, in order."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[bytes, int] = OrderedDict()
+
+    def __bool__(self) -> bool:
+        return bool(self._last)
+
+    def take(self, stamp: bytes) -> bool:
+        """Whether a message with this stamp is newer than all earlier ones of its sender."""
+        sender, number = stamp[:SENDER], int.from_bytes(stamp[SENDER:], "little")
+        if number <= self._last.get(sender, -1):
+            return False
+        self._last[sender] = number
+        self._last.move_to_end(sender)
+        if len(self._last) > _SENDERS:
+            self._last.popitem(last=False)
+        return True
+
+
 class Heard:
     """Publications on ``key`` of the sender that answers, each once and in order.
 
@@ -217,55 +238,26 @@ class Heard:
         self.refused = self.old = 0
         self.is_unknown = False
         self._by, self._key = authenticator, key
-        self._last = (b"", -1)
+        self._sender, self._rising = b"", Rising()
 
     def meet(self, stamp: bytes) -> None:
         """Believe the sender of a reply from now on, as to what it publishes after it."""
-        sender, number = _split(stamp)
-        if sender != self._last[0] or number > self._last[1]:
-            self._last = sender, number
+        self._rising.take(stamp)
+        self._sender = stamp[:SENDER]
 
     def take(self, sample: zenoh.Sample) -> bytes | None:
         """The payload of a publication; None where it is refused, or repeated."""
         signed = self._by.heard(sample, self._key)
-        self.is_unknown = False
+        self.is_unknown = signed is not None and signed.stamp[:SENDER] != self._sender
         if signed is None:
             if not self.refused:
                 _LOGGER.warning("%s: messages without the authenticator of the service are passed over", self._key)
             self.refused += 1
-            return None
-        if not self._by:
+        elif not self._by or (not self.is_unknown and self._rising.take(signed.stamp)):
             return signed.payload
-        sender, number = _split(signed.stamp)
-        if sender != self._last[0]:
-            self.is_unknown = True
-            return None
-        if number <= self._last[1]:
+        elif not self.is_unknown:
             self.old += 1
-            return None
-        self._last = sender, number
-        return signed.payload
-
-
-class Rising:
-    """The highest number of each of the last senders: each of their messages counts once, in order."""
-
-    def __init__(self) -> None:
-        self._last: OrderedDict[bytes, int] = OrderedDict()
-
-    def __bool__(self) -> bool:
-        return bool(self._last)
-
-    def take(self, stamp: bytes) -> bool:
-        """Whether a message with this stamp is newer than all earlier ones of its sender."""
-        sender, number = _split(stamp)
-        if number <= self._last.get(sender, -1):
-            return False
-        self._last[sender] = number
-        self._last.move_to_end(sender)
-        if len(self._last) > _SENDERS:
-            self._last.popitem(last=False)
-        return True
+        return None
 
 
 class HeardSamples:
@@ -293,10 +285,6 @@ class HeardSamples:
 def payload_of(data: zenoh.ZBytes | None) -> bytes:
     """The bytes of a payload or an attachment; none of one that is not there."""
     return b"" if data is None else data.to_bytes()
-
-
-def _split(stamp: bytes) -> tuple[bytes, int]:
-    return stamp[:SENDER], int.from_bytes(stamp[SENDER:], "little")
 
 
 # --- The key.

@@ -1,9 +1,8 @@
 """Who owns ``command`` of an axis: one controller at a time, by a lease that ends with it.
 
-A controller holds a liveliness token while it commands. The key of the token says who it is, and carries the
-authenticator where there is a key (docs/protocol.md, "Who commands"). Of several tokens the latest counts, by the clock
-that no leap moves. The party that applies the voltages takes those of the owner alone (`CommandGate`); while nobody
-holds a token it takes what comes.
+A controller holds a token while it commands (`service.security.tokens`). Of several the latest counts, by a clock that
+is never set. The party that applies the voltages takes those of the owner alone (`CommandGate`); while nobody holds a
+token it takes what comes.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any, Final
 
 import zenoh
@@ -25,97 +22,34 @@ from service.protocol.errors import CommandHeldError
 from service.protocol.keys import Keys
 from service.runtime.session import LEASE_S, SURELY
 from service.security.authenticator import SENDER, STAMP, Authenticator, Rising, payload_of
+from service.security.tokens import Holder, Tokens
 
 _LOGGER: Final = logging.getLogger("dehyst.security")
-_KEY: Final = re.compile(
-    r"/owner/([0-9]{1,13})/([0-9a-f]{16})/([0-9]{1,10})/([A-Za-z0-9._-]{1,64})/([0-9]{1,13})(?:/([0-9a-f]{1,64}))?$"
-)
 #: Longest wait for the tokens that are alive, s; on loopback it takes 0.3 ms.
 _ASK_S: Final = 1.0
 _PAUSE_S: Final = 0.02
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Holder:
-    """A controller that holds a token; the greatest one is the owner.
-
-    Attributes
-    ----------
-    order : ms that its host had run when it took the token, and above that of all tokens that it knew.
-    sender : of its commands, 16 hexadecimal digits (`service.security.authenticator`). process, host : where it runs.
-    since_unix_ms : when it took the token by the clock on the wall, for people alone.
-    """
-
-    order: int
-    sender: str
-    process: int
-    host: str
-    since_unix_ms: int
-
-    @property
-    def name(self) -> str:
-        """The part of the token's key that says who it is."""
-        return f"{self.order}/{self.sender}/{self.process}/{self.host}/{self.since_unix_ms}"
-
-    def __str__(self) -> str:
-        since = datetime.fromtimestamp(self.since_unix_ms / 1e3, UTC)
-        return f"process {self.process} on {self.host} since {since:%Y-%m-%d %H:%M:%S} UTC"
-
-    def to_json(self) -> dict[str, Any]:
-        """For a status."""
-        return {"process": self.process, "host": self.host, "since_unix_s": self.since_unix_ms / 1e3}
-
-
-def tag_of(by: Authenticator, keys: Keys, holder: Holder) -> str:
-    """The tag in the key of a token, in hexadecimal digits; "" without a key."""
-    return by.tag("owner", keys.owner(holder.name)).hex()
-
-
-def read_token(by: Authenticator, keys: Keys, key: str) -> Holder | None:
-    """Who holds the token ``key``; None where it is malformed, or its tag is wrong."""
-    found = _KEY.search(key)
-    if found is None:
-        return None
-    holder = Holder(int(found[1]), found[2], int(found[3]), found[4], int(found[5]))
-    return None if by and found[6] != tag_of(by, keys, holder) else holder
-
-
-class Holders:
-    """The tokens of an axis that are alive; zenoh's thread keeps them.
-
-    Attributes
-    ----------
-    alive : who holds one. owner : the greatest of them; None: nobody. refused : count of tokens without a right tag.
-    """
+class Holders(Tokens[Holder]):
+    """The controllers that hold a token of an axis."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, by: Authenticator) -> None:
-        self.alive: frozenset[Holder] = frozenset()
-        self.owner: Holder | None = None
-        self.refused = 0
-        self._keys, self._by = keys, by
-        self._subscriber: Any = session.liveliness().declare_subscriber(keys.owner_any, self._on_token, history=True)
+        super().__init__(Holder, by, keys)
+        self.subscribe(session)
 
-    def _on_token(self, sample: zenoh.Sample) -> None:
-        appeared = sample.kind == zenoh.SampleKind.PUT
-        holder = read_token(self._by, self._keys, str(sample.key_expr))
-        if holder is None:
-            self.refused += appeared
-            return
-        self.alive = self.alive | {holder} if appeared else self.alive - {holder}
-        self.owner = max(self.alive, default=None)
+    @property
+    def owner(self) -> Holder | None:
+        """The one whose commands count; None: nobody's do alone."""
+        return max(self.alive, default=None)
 
     def to_json(self) -> dict[str, Any]:
         """For a status: ``owner``, null where nobody holds ``command``; ``others`` that hold a token; ``refused``."""
-        owner, alive = self.owner, self.alive
+        *others, owner = sorted(self.alive) or (None,)
         return {
             "owner": None if owner is None else owner.to_json(),
-            "others": [holder.to_json() for holder in sorted(alive) if holder != owner],
+            "others": [holder.to_json() for holder in others if holder is not None],
             "refused": self.refused,
         }
-
-    def undeclare(self) -> None:
-        """End."""
-        self._subscriber.undeclare()
 
 
 class CommandGate(Holders):
@@ -138,21 +72,18 @@ class CommandGate(Holders):
         self._commands: Any = session.declare_subscriber(keys.command, self._on_command)
 
     def _on_command(self, sample: zenoh.Sample) -> None:
-        with self._one:
-            self._take(sample)
-
-    def _take(self, sample: zenoh.Sample) -> None:
         payload, owner = sample.payload.to_bytes(), self.owner
-        # Without an owner too: what is sent while the token is on its way counts as sent.
-        stranger = self._stranger(sample, payload, owner)
-        if owner is None or not stranger:
-            self._receive(payload)
-            return
-        if owner != self._warned:
-            self._warned = owner
-            detail = "voltages of %s are left out, because %s owns it; later ones are only counted"
-            _LOGGER.warning(f"%s: {detail}", self._keys.command, stranger, owner)
-        self.foreign, self.stranger = self.foreign + 1, stranger
+        with self._one:
+            # Without an owner too: what is sent while the token is on its way counts as sent.
+            stranger = self._stranger(sample, payload, owner)
+            if owner is None or not stranger:
+                self._receive(payload)
+                return
+            if owner != self._warned:
+                self._warned = owner
+                detail = "voltages of %s are left out, because %s owns it; later ones are only counted"
+                _LOGGER.warning(f"%s: {detail}", self._keys.command, stranger, owner)
+            self.foreign, self.stranger = self.foreign + 1, stranger
 
     def _stranger(self, sample: zenoh.Sample, payload: bytes, owner: Holder | None) -> str:
         """Who sent a command, where that is not the owner; else ""."""
@@ -213,8 +144,7 @@ class CommandLease:
             order = max([round(1e3 * time.monotonic()), *(holder.order + 1 for holder in others)])
             since_unix_ms = round(1e3 * time.time())
             self._holder = Holder(order, self._by.sender.hex(), os.getpid(), _host(), since_unix_ms)
-            tag = tag_of(self._by, self._keys, self._holder)
-            self._token = self._session.liveliness().declare_token(self._keys.owner(self._holder.name, tag))
+            self._token = self._session.liveliness().declare_token(self._holder.key(self._by, self._keys))
             self._holders = Holders(self._session, self._keys, self._by)
             rivals: Iterable[Holder] = self._others()  # two may have begun at once
         else:
@@ -227,8 +157,8 @@ class CommandLease:
 
     def _others(self) -> set[Holder]:
         """Who else holds a token now, as the other end of the session knows."""
-        found = self._session.liveliness().get(self._keys.owner_any, timeout=_ASK_S)
-        holders = {read_token(self._by, self._keys, str(reply.ok.key_expr)) for reply in found if reply.ok is not None}
+        found = self._session.liveliness().get(self._keys.tokens(Holder.KIND), timeout=_ASK_S)
+        holders = {Holder.read(self._by, self._keys, str(reply.ok.key_expr)) for reply in found if reply.ok is not None}
         return {holder for holder in holders if holder is not None and holder.sender != self._by.sender.hex()}
 
     def _held(self, owner: Holder) -> CommandHeldError:

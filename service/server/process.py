@@ -17,7 +17,7 @@ import zenoh
 from threadpoolctl import threadpool_limits
 
 from service.config.settings import ServeConfig
-from service.failover.role_control import Reachability, RoleControl
+from service.failover.role_control import RoleControl
 from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
@@ -30,7 +30,7 @@ from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.long_queries import LongQueries
 from service.server.status import UNSIGNED
-from service.storage.checkpoint import learn_again, restore_newest
+from service.storage.checkpoint import restore_newest
 
 _LOGGER: Final = logging.getLogger("dehyst.service")
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
@@ -119,14 +119,9 @@ def _restore(server: AxisServer) -> None:
     """
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
     server.checkpoints.hold(_HOLD_S)
-    number = None if folder is None else restore_newest(axis, folder)
     switch = server.journal().last_switch()
-    if switch is not None and folder is not None and number is not None:
-        meta = folder.meta(number)
-        switch = None if meta is not None and switch.is_in(meta) else switch
-    if number is not None and axis.config.recorder is not None:
-        learn_again(axis, axis.config.recorder, switch)
-    elif switch is not None:
+    number = None if folder is None else restore_newest(axis, folder, axis.config.recorder, switch)
+    if number is None and switch is not None:
         switch.apply(axis)
     if sink is not None:
         sink.rebase(axis.sequence.received)
@@ -206,8 +201,7 @@ class Service:
                 )
                 self.axes.append(server)
                 _restore(server)
-                reachability = Reachability(self._session, behind_routers=not config.listen)
-                control = RoleControl(self._session, server, patience_s, reachability, peer_files)
+                control = RoleControl(self._session, server, patience_s, not config.listen, peer_files)
                 self._role_controls.append(control)
                 server.listen()
                 control.start()

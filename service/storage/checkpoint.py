@@ -16,12 +16,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Annotated, Any, Final
 
 from adaptive.errors import DehystError, ModelFileError
-from adaptive.state import MOST_FLOAT, MOST_INT
-from adaptive.types import OnlineModel, StateDict, under
+from adaptive.state import Entry, load
+from adaptive.types import OnlineModel, StateDict, joined, under
 from service.intake.sample_queue import SampleQueue
+from service.operating.server import Switch
 from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_body, decode_header, encode_body, split_state
 from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
@@ -42,43 +43,32 @@ LOCK: Final = ".lock-checkpoints"
 _LEAST_KEPT: Final = 2
 
 
-_META_TYPES: Final[dict[str, tuple[type, ...]]] = {
-    "stage": (str,), "axis": (str,), "dt_s": (float, int), "seq": (int,), "samples": (int,),
-    "time_unix_s": (float, int), "instance": (str,), "schema": (int,), "models": (dict,),
-}  # fmt: skip
-
-
 @dataclass(frozen=True, slots=True)
 class CheckpointMeta:
-    """The axis and the sample that a checkpoint belongs to.
+    """The axis and the sample that a checkpoint belongs to, declared as the state itself (`adaptive.state`)."""
 
-    Attributes
-    ----------
-    stage, axis : names on the wire. dt_s : sample time, s. units : those of the model file.
-    models : digest of each model in the model file that the state grew from, by name.
-    schema : version of the state. seq : number of the last sample handled. samples : count of all samples handled.
-    time_unix_s : time of writing, s; for display only. instance : the instance that wrote it.
-    """
+    stage: Annotated[str, Entry("stage on the wire")]
+    axis: Annotated[str, Entry("axis on the wire")]
+    dt_s: Annotated[float, Entry("sample time", "s", low=5e-324)]
+    seq: Annotated[int, Entry("number of the last sample handled")]
+    samples: Annotated[int, Entry("count of all samples handled")]
+    time_unix_s: Annotated[float, Entry("time of writing, to be shown and for operations in the journal", "s")] = 0.0
+    instance: Annotated[str, Entry("the instance that wrote it")] = ""
+    schema: Annotated[int, Entry("version of the state")] = STATE_SCHEMA
+    models: Annotated[dict[str, str], Entry("digests of the models in the model file that it grew from")] = field(
+        default_factory=dict
+    )
+    units: Annotated[dict[str, str], Entry("those of the model file")] = field(default_factory=lambda: dict(UNITS))
 
-    stage: str
-    axis: str
-    dt_s: float
-    seq: int
-    samples: int
-    time_unix_s: float = 0.0
-    instance: str = ""
-    schema: int = STATE_SCHEMA
-    models: dict[str, str] = field(default_factory=dict)
-    units: dict[str, str] | None = None
-
-    def __post_init__(self) -> None:
-        for name, kinds in _META_TYPES.items():
-            value = getattr(self, name)
-            if not isinstance(value, kinds) or isinstance(value, bool):
-                raise ModelFileError(f"{name}: got {str(value)[:40]!r}, expected {kinds[0].__name__}")
-        if max(abs(self.seq), abs(self.samples)) > MOST_INT or not (0.0 < self.dt_s < MOST_FLOAT):
-            got = f"{str(self.seq)[:40]}, {str(self.samples)[:40]}, {self.dt_s}"
-            raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers within 3 x 2^61 and a time in s")
+    @classmethod
+    def of(cls, header: Mapping[str, Any]) -> CheckpointMeta:
+        """From the header of a file. Raises ModelFileError."""
+        try:
+            tables = {name: value for name, value in header["meta"].items() if isinstance(value, dict)}
+            rest = {name: value for name, value in header["meta"].items() if name not in tables}
+        except (KeyError, AttributeError) as error:
+            raise ModelFileError(f"its header is not valid: {error!r}") from error
+        return load(cls, rest | joined(tables))
 
     def refuse_unless(self, stage: str, axis: str, dt_s: float, models: Mapping[str, str]) -> None:
         """Raise ModelFileError with the reason if the checkpoint is of another axis, model file or version."""
@@ -103,7 +93,7 @@ class CheckpointMeta:
 def encode_checkpoint(meta: CheckpointMeta, state: StateDict) -> list[Any]:
     """The bytes of a checkpoint as buffers in order; arrays are not copied."""
     values, arrays = split_state(state)
-    body = encode_body({"meta": {**asdict(meta), "units": UNITS}, "values": values}, arrays)
+    body = encode_body({"meta": asdict(meta), "values": values}, arrays)
     digest = hashlib.blake2b(digest_size=16)
     for buffer in body:
         digest.update(buffer)
@@ -122,7 +112,7 @@ def decode_checkpoint(data: bytes) -> tuple[CheckpointMeta, StateDict]:
         raise ModelFileError("damaged or cut off: its digest does not match")
     try:
         header, arrays = decode_body(body, length, len(body))
-        return CheckpointMeta(**header["meta"]), dict(header["values"]) | arrays
+        return CheckpointMeta.of(header), dict(header["values"]) | arrays
     except (ValueError, KeyError, TypeError) as error:
         raise ModelFileError(f"its header is not valid: {error!r}") from error
 
@@ -207,12 +197,6 @@ class CheckpointFolder:
         meta.refuse_unless(*self._belongs)
         return meta, state
 
-    def meta(self, number: int) -> CheckpointMeta | None:
-        """What a checkpoint belongs to; None if it cannot be read."""
-        with contextlib.suppress(OSError, ModelFileError):
-            return _read_meta(self.directory / f"checkpoint-{number:09d}{SUFFIX}")
-        return None
-
     def numbers(self) -> list[int]:
         """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
@@ -272,27 +256,14 @@ def _read_meta(path: Path) -> CheckpointMeta:
         if length > MAX_HEADER_BYTES:
             raise ModelFileError("not a checkpoint")
         try:
-            return CheckpointMeta(**decode_header(file.read(length))["meta"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ModelFileError(f"its header is not valid: {error!r}") from error
+            return CheckpointMeta.of(decode_header(file.read(length)))
+        except ValueError as error:
+            raise ModelFileError(f"its header is not valid: {error}") from error
 
 
 # --- Writes the checkpoints of an axis, and restores an axis from a checkpoint and the journal behind it.
 #
 # The thread that handles samples only copies the state; a thread of its own encodes and writes it.
-
-
-class Switch(Protocol):
-    """An operator's command that the operators' journal holds: freeze or thaw."""
-
-    @property
-    def samples(self) -> int:
-        """Count of all samples handled before it held."""
-        ...
-
-    def apply(self, axis: Axis) -> None:
-        """Apply it."""
-        ...
 
 
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
@@ -452,33 +423,46 @@ class CheckpointKeeper:
                 self._ready.notify_all()
 
 
-def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
+def restore_newest(
+    axis: Axis,
+    folder: CheckpointFolder,
+    recordings: Path | None = None,
+    switch: Switch | None = None,
+    whose: str = "",
+    wanted: Callable[[CheckpointMeta], bool] = lambda _: True,
+) -> int | None:
     """Restore ``axis`` from the newest checkpoint that is complete and matches; returns its number, None for none.
 
-    A refused checkpoint is noted as an event with the reason, and the previous one is tried.
+    Then the samples behind it in ``recordings`` are learnt, and ``switch`` is applied at its sample unless it is in the
+    checkpoint. A refused checkpoint is noted as an event with the reason, and the previous one is tried.
+
+    ``whose`` : words behind a number. ``wanted`` : whether to restore the first that matches; else none is.
     """
     for number in folder.numbers():
         try:
             meta, state = folder.read(number)
+            if not wanted(meta):
+                return None
             axis.restore(state)
-        except ModelFileError as error:
+        except (ModelFileError, OSError) as error:
             folder.refused += 1
-            axis.note("checkpoint_refused", f"checkpoint {number}: {error}")
+            axis.note("checkpoint_refused", f"checkpoint {number}{whose}: {error}")
             continue
-        axis.note("restored", f"from checkpoint {number}, sample {meta.seq}", checkpoint=number)
+        axis.note("restored", f"from checkpoint {number}{whose}, sample {meta.seq}", checkpoint=number)
+        learn_again(axis, recordings, None if switch is None or switch.is_in(meta) else switch)
         return number
     return None
 
 
-def learn_again(axis: Axis, recordings: Path, switch: Switch | None = None) -> int:
-    """Learn the samples after the restored state again, from the journals in the folder ``recordings``.
+def learn_again(axis: Axis, recordings: Path | None, switch: Switch | None = None) -> int:
+    """Learn the samples after the restored state again, from the journals in the folder ``recordings``, if any.
 
     ``switch`` : an operator's command that the restored state does not include; it is applied after the sample after
     which it held, or at the end if the journals do not reach that far. Returns the number of samples. They are not
     recorded a second time.
     """
     begun = axis.sequence.received
-    rows = rows_behind(recordings, begun, axis.owner)
+    rows = None if recordings is None else rows_behind(recordings, begun, axis.owner)
     count = 0 if rows is None else len(rows)
     first = max(0, count - _MOST_AGAIN)
     at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)
@@ -492,7 +476,6 @@ def learn_again(axis: Axis, recordings: Path, switch: Switch | None = None) -> i
         start = stop
     if switch is not None and at >= count:
         switch.apply(axis)
-    if rows is None:
-        return 0
-    axis.note("learnt_again", f"{len(rows) - first} samples from the journal")
-    return len(rows) - first
+    if rows is not None:
+        axis.note("learnt_again", f"{count - first} samples from the journal")
+    return count - first

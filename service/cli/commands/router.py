@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     """Route until interrupted. Returns 0. Raises DehystError where an endpoint is in use or not allowed."""
     from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_router
     from service.runtime.stopping import StopSignal
-    from service.security.check import check_reach, has_access_control
+    from service.security.access import check_reach, has_access_control
     from service.security.refusals import count_refusals, refusal_counters
 
     listen = [check_endpoint("--listen", endpoint) for endpoint in args.listen or [DEFAULT_ENDPOINT]]

@@ -17,7 +17,7 @@ from service.protocol.errors import FieldError
 from service.runtime.descriptors import need_descriptors
 from service.runtime.memory import starting
 from service.runtime.session import check_endpoint, is_loopback
-from service.security.check import has_access_control
+from service.security.access import has_access_control
 from service.security.refusals import count_refusals
 
 if TYPE_CHECKING:

@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
     if args.examples is not None:
         return write_example_files(args.examples)
     from service.runtime.session import open_client, open_service
-    from service.security.check import check_reach
+    from service.security.access import check_reach
     from service.stage_node.node import NodeConfig, StageNode
 
     stop = StopSignal(raising=True)

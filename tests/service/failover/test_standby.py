@@ -17,10 +17,12 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.role_control import Claim, Claims, claim_key, read_claim
+from service.failover.role_control import Claims
+from service.operating.remote import operate
 from service.protocol.keys import Keys
 from service.runtime.session import open_client
 from service.security.authenticator import NO_KEY, own_authenticator
+from service.security.tokens import Claim
 from sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
@@ -149,14 +151,14 @@ def test_who_serves_claims_anew_where_another_goes_on_serving(tmp_path: Path, pr
     heard: list[tuple[int, bool]] = []
 
     def on_claim(sample: zenoh.Sample) -> None:
-        claim = read_claim(NO_KEY, keys, str(sample.key_expr))
+        claim = Claim.read(NO_KEY, keys, str(sample.key_expr))
         if claim is not None and claim.instance == instance:
             heard.append((claim.epoch, sample.kind == zenoh.SampleKind.PUT))
 
     with open_client(endpoints, 20.0) as session, Client.connect(endpoints, wait_s=20.0) as client:
-        session.liveliness().declare_subscriber(keys.claim_any, on_claim, history=True)
+        session.liveliness().declare_subscriber(keys.tokens("claim"), on_claim, history=True)
         eventually(lambda: heard == [(1, True)])
-        deaf = session.liveliness().declare_token(claim_key(own_authenticator(), keys, Claim(0, "i0-deaf")))
+        deaf = session.liveliness().declare_token(Claim(0, "i0-deaf").key(own_authenticator(), keys))
         eventually(lambda: len(heard) >= 5)
         deaf.undeclare()
         # Never without one: whoever stands by would take over.
@@ -229,7 +231,8 @@ def test_a_standby_that_loses_its_router_does_not_take_itself_for_the_successor(
 def test_a_standby_that_a_stranger_tells_that_it_differs_asks_who_serves(
     tmp_path: Path, processes: list[Process]
 ) -> None:
-    """Forged statuses, published and as answers, and events say so. It compares with the one that serves alone."""
+    """Forged statuses, published and as answers, events and unsigned verbs say so. It fetches the state no more; only
+    when the one that serves tells it of a verb."""
     config, endpoints = pair_config(tmp_path)
     processes.append(Process("serve", "--config", str(config)))
     processes.append(Process("serve", "--config", str(config), "--standby"))
@@ -251,15 +254,29 @@ def test_a_standby_that_a_stranger_tells_that_it_differs_asks_who_serves(
             with query:
                 query.reply(keys.status, json.dumps({"instance": first, "fingerprint": "?", **said}))
 
+        asked: list[str] = []
+
+        def see(query: zenoh.Query) -> None:
+            with query:
+                asked.append(str(query.parameters))
+
+        seeing = session.declare_queryable(keys.state, see)
         queryable = session.declare_queryable(keys.status, lie, complete=True)
         for _ in range(150):
             said["snapshot_seq"] = client.status()["snapshot_seq"]
             session.put(keys.status, json.dumps({"instance": first, "fingerprint": "?", **said}))
             session.put(keys.event, json.dumps({"event": "selected", "instance": first}))
+            verb = {"instance": first, "verb": "select", "by": "alice", "samples": 10**9}
+            session.get(keys.switch, payload=json.dumps(verb), timeout=0.1)
             time.sleep(0.01)
         queryable.undeclare()
         heard = len(told)
         eventually(lambda: len(told) > heard + 2 and told[-1]["synced"])
+        assert not asked
+        operate(session, keys, "select", "alice", {"model": "linear"})
+        eventually(lambda: bool(asked))
+        eventually(lambda: told[-1]["served"] == "linear")
+        seeing.undeclare()
         processes[0].process.kill()
         eventually(lambda: any(event["event"] == "took_over" for event in events))
     (took,) = (event for event in events if event["event"] == "took_over")
@@ -307,20 +324,20 @@ def test_the_greatest_claim_serves() -> None:
     keys = Keys("demo", "x")
     claims = Claims(keys, "i-me")
     assert (claims.highest(), claims.next_epoch()) == (None, 1)
-    claims.update(keys.claim(3, "i-me"), True)  # one's own is no news
+    claims.update(keys.token("claim", "3/i-me"), True)  # one's own is no news
     assert claims.highest() is None
-    claims.update(keys.claim(1, "i-b"), True)
-    claims.update(keys.claim(2, "i-a"), True)
-    claims.update(keys.claim(2, "i-c"), True)
+    claims.update(keys.token("claim", "1/i-b"), True)
+    claims.update(keys.token("claim", "2/i-a"), True)
+    claims.update(keys.token("claim", "2/i-c"), True)
     assert claims.highest() == Claim(2, "i-c")
-    claims.update(keys.claim(2, "i-c"), False)
+    claims.update(keys.token("claim", "2/i-c"), False)
     assert claims.highest() == Claim(2, "i-a")
-    claims.update(keys.claim(2, "i-a"), False)
-    claims.update(keys.claim(1, "i-b"), False)
+    claims.update(keys.token("claim", "2/i-a"), False)
+    claims.update(keys.token("claim", "1/i-b"), False)
     assert (claims.highest(), claims.next_epoch()) == (None, 3)
     claims.update("dehyst/v1/demo/x/alive/i-b", True)
     assert claims.highest() is None
-    assert read_claim(NO_KEY, keys, "x") is None
+    assert Claim.read(NO_KEY, keys, "x") is None
     assert np.all([Claim(2, "a") > Claim(1, "z"), Claim(2, "b") > Claim(2, "a")])
 
 

@@ -193,7 +193,7 @@ def test_who_takes_over_without_a_state_goes_on_from_what_the_other_left_behind(
     for first in range(700, 900, 20):
         loop.handle(recording(first, 20))
     told = model.take_over(lambda newest: restore_from_peer(axis, files, "demo", newest))
-    assert told.startswith("checkpoint 1 of the other instance, sample 599, and 200 samples of its journal, then 100")
+    assert told.startswith("checkpoint 1 of the other instance and its journal, sample 799, then 100")
     gone.handle(recording(800, 100))
     assert axis.sequence.lost == 0
     assert same(axis, gone)
@@ -218,7 +218,7 @@ def test_a_damaged_checkpoint_of_the_other_is_passed_over_with_the_reason(tmp_pa
     assert restore_from_peer(axis, files, "demo", -1).startswith("checkpoint 1 of the other instance")
     assert axis.handled_seq == 799
     events = axis.take_events()
-    assert [event["event"] for event in events] == ["checkpoint_refused", "learnt_again"]
+    assert [event["event"] for event in events] == ["checkpoint_refused", "restored", "learnt_again"]
     assert "checkpoint 2 of the other instance" in events[0]["detail"]
     # It is the other's folder: nothing of it is changed.
     assert restore_newest(make_axis(), folder(files.checkpoints)) == 1

@@ -15,12 +15,13 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.role_control import MAX_EPOCH, Claim, Claims, claim_key, read_claim
+from service.failover.role_control import Claims
 from service.failover.state_transfer import fetch_state, part_of, status_of, tell_standbys
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_router
 from service.security.authenticator import EVERYBODY, NO_KEY, Authenticator
+from service.security.tokens import Claim
 from tests.service.conftest import unused_port
 from tests.service.failover.test_standby import pair_config
 from tests.service.living import Process, Stage, eventually
@@ -54,22 +55,23 @@ def endpoint() -> Iterator[str]:
 def test_a_claim_with_a_wrong_tag_or_an_absurd_epoch_is_none() -> None:
     claims = Claims(KEYS, "i-me", OURS)
     for key in (
-        KEYS.claim(9, "i-rogue"),
-        KEYS.claim(9, "i-rogue", "00"),
-        claim_key(THEIRS, KEYS, Claim(9, "i-rogue")),
-        claim_key(OURS, KEYS, Claim(8, "i-rogue")).replace("/8/", "/9/"),
-        claim_key(OURS, Keys("demo", "y"), Claim(9, "i-rogue")).replace("/y/", "/x/"),
+        KEYS.token("claim", "9/i-rogue"),
+        KEYS.token("claim", "9/i-rogue", "00"),
+        Claim(9, "i-rogue").key(THEIRS, KEYS),
+        Claim(8, "i-rogue").key(OURS, KEYS).replace("/8/", "/9/"),
+        Claim(9, "i-rogue").key(OURS, Keys("demo", "y")).replace("/y/", "/x/"),
     ):
         claims.update(key, True)
         assert claims.highest() is None
-    assert claims.unsigned == 5
+    assert claims.refused == 5
     assert claims.next_epoch() == 1
-    claims.update(claim_key(OURS, KEYS, Claim(3, "i-peer")), True)
+    claims.update(Claim(3, "i-peer").key(OURS, KEYS), True)
     assert claims.highest() == Claim(3, "i-peer")
     claims.ignore(Claim(3, "i-peer"))
     assert claims.highest() is None
-    for epoch in ("²", "١", "-1", str(MAX_EPOCH + 1), "9" * 400, "1.5", ""):
-        assert read_claim(NO_KEY, KEYS, f"{KEYS.base}/claim/{epoch}/i-a") is None
+    assert Claim.read(NO_KEY, KEYS, KEYS.claim(10**9, "i-a")) == Claim(10**9, "i-a")
+    for epoch in ("²", "١", "-1", str(10**9 + 1), "9" * 400, "1.5", ""):
+        assert Claim.read(NO_KEY, KEYS, f"{KEYS.base}/claim/{epoch}/i-a") is None
 
 
 def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> None:
@@ -99,7 +101,7 @@ def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> 
         assert len(refused) == 1
         assert fetch_state(asking, KEYS.state, 5.0) is None
         assert fetch_state(asking, KEYS.state, 5.0, authenticator=THEIRS) is None
-        assert len(refused) == 3
+        assert len(refused) == 1 + 2 * 4  # asked again each time: anybody may refuse
         by[0] = NO_KEY  # a stranger that answers anybody
         with pytest.raises(ServiceError, match="does not know the key"):
             fetch_state(asking, KEYS.state, 5.0, authenticator=OURS)
@@ -214,7 +216,7 @@ def test_a_stranger_deposes_nobody_and_a_dead_ones_claim_holds_nobody_up(
         Stage(endpoints),
     ):
         stranger.liveliness().declare_subscriber(
-            KEYS.claim_any, lambda sample: heard.append(str(sample.key_expr)), history=True
+            KEYS.tokens("claim"), lambda sample: heard.append(str(sample.key_expr)), history=True
         )
         stranger.declare_subscriber(KEYS.event, lambda sample: events.append(sample.payload.to_string()))
         eventually(lambda: client.status()["samples"]["learnt"] > 300)
@@ -225,7 +227,7 @@ def test_a_stranger_deposes_nobody_and_a_dead_ones_claim_holds_nobody_up(
                 query.reply(KEYS.status, what, attachment=query.attachment)
 
         answering = stranger.declare_queryable(KEYS.status, impostor, complete=True)
-        rogue = stranger.liveliness().declare_token(KEYS.claim(1_000_000, "i9-rogue"))
+        rogue = stranger.liveliness().declare_token(KEYS.token("claim", "1000000/i9-rogue"))
         until = time.monotonic() + 4.0
         while time.monotonic() < until:
             status = client.status()

@@ -23,8 +23,17 @@ from service.protocol import samples as wire
 from service.protocol.errors import NoReplyError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client
-from service.security.access import ROLES, Plan, access_control, add, create, read_plan, remove
-from service.security.check import check_reach, missing_protection
+from service.security.access import (
+    ROLES,
+    Plan,
+    access_control,
+    add,
+    check_reach,
+    create,
+    missing_protection,
+    read_plan,
+    remove,
+)
 from service.security.refusals import Refusals
 from tests.service.conftest import ServeProcess, unused_port, write_config
 

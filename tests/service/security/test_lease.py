@@ -25,7 +25,8 @@ from service.protocol.errors import CommandHeldError
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client, open_service, wait_followed
 from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
-from service.security.lease import CommandGate, CommandLease, Holder, read_token, tag_of
+from service.security.lease import CommandGate, CommandLease
+from service.security.tokens import Holder
 from service.stage_node.node import status_key
 from tests.service.living import eventually
 
@@ -214,7 +215,8 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
         stranger.declare_subscriber(KEYS.command, lambda s: recorded.append((s.payload.to_bytes(), s.attachment)))
         later = Holder(9_999_999_999_999, "ab" * 8, 1, "elsewhere", 0)
         tokens = [
-            stranger.liveliness().declare_token(KEYS.owner(later.name, tag)) for tag in ("", "00" * 16, "nonsense")
+            stranger.liveliness().declare_token(KEYS.token("owner", later.name, tag))
+            for tag in ("", "00" * 16, "nonsense")
         ]
         lease = CommandLease(stranger, KEYS, Authenticator(os.urandom(16)))
         lease.take()
@@ -303,14 +305,14 @@ def test_without_a_key_two_controllers_of_one_process_are_two(stage: tuple[Stage
 def test_a_token_says_who_holds_it_and_proves_it(order: int, process: int, host: str, since_unix_ms: int) -> None:
     ours, theirs = own_authenticator(), Authenticator(os.urandom(16))
     holder = Holder(order, "0123456789abcdef", process, host, since_unix_ms)
-    key = KEYS.owner(holder.name, tag_of(ours, KEYS, holder))
-    assert read_token(ours, KEYS, key) == holder == read_token(NO_KEY, KEYS, KEYS.owner(holder.name))
+    key = holder.key(ours, KEYS)
+    assert Holder.read(ours, KEYS, key) == holder == Holder.read(NO_KEY, KEYS, KEYS.token("owner", holder.name))
     assert str(holder).startswith(f"process {process} on {host} since ")
-    assert read_token(theirs, KEYS, key) is None
-    assert read_token(ours, Keys("demo", "y"), key.replace("/x/", "/y/")) is None
-    assert read_token(ours, KEYS, KEYS.owner(holder.name)) is None
+    assert Holder.read(theirs, KEYS, key) is None
+    assert Holder.read(ours, Keys("demo", "y"), key.replace("/x/", "/y/")) is None
+    assert Holder.read(ours, KEYS, KEYS.token("owner", holder.name)) is None
 
 
 @given(st.text())
 def test_a_token_of_another_form_is_none(text: str) -> None:
-    assert read_token(NO_KEY, KEYS, f"{KEYS.base}/owner/{text}/") is None
+    assert Holder.read(NO_KEY, KEYS, f"{KEYS.base}/owner/{text}/") is None

@@ -115,9 +115,14 @@ def test_the_states_that_are_forged_are_taken_as_they_are() -> None:
         {"dt_s": "fast"},
         {"stage": 3},
         {"seq": True},
+        {"dt_s": 0.0},
+        {"models": {"linear": 1}},
+        {"models": "linear"},
+        {"unknown": 1},
     ],
 )
 def test_a_checkpoint_of_wrong_numbers_is_refused(changes: dict[str, Any]) -> None:
-    valid = asdict(CheckpointMeta("demo", "x", DT_S, 1, 1))
+    valid = asdict(CheckpointMeta("demo", "x", DT_S, 1, 1, models={"linear": "00"}))
+    assert CheckpointMeta.of({"meta": valid}) == CheckpointMeta(**valid)
     with pytest.raises(ModelFileError, match=next(iter(changes))):
-        CheckpointMeta(**(valid | changes))
+        CheckpointMeta.of({"meta": valid | changes})
