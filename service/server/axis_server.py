@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import zenoh
 
-from service.answers.answering import trust_by_age
+from service.answers.which_model import trust_by_age
 from service.background.retuner import Retuner
 from service.failover.state_transfer import tell_standbys
 from service.intake.sample_queue import SampleQueue
