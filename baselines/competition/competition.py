@@ -445,11 +445,6 @@ class Competition:
         self._frozen, self._changed = False, True
         self.favourite.thaw()
 
-    @property
-    def frozen(self) -> bool:
-        """Whether learning is stopped."""
-        return self._frozen
-
     def resync(self) -> None:
         """Accept the next sample whatever its sequence number, because the stage has restarted."""
         for model in self._models:
@@ -481,22 +476,18 @@ class Competition:
         self.judge.adopt_tracked_memories(self._models, self._newest)
         self.judge.remember(self._seq, self._newest)
         if not self._frozen:
-            self._choose(unusable, float(rows[4].sum()) * self._dt_s)
+            self._choose([math.inf if bad else self.judge.rms_V(i) for i, bad in enumerate(unusable)], rows[4].sum())
         self._serving = self._served()
         self._changed = False
 
-    def _choose(self, unusable: list[bool], scored_s: float) -> None:
-        errors_V = [math.inf if bad else self.judge.rms_V(i) for i, bad in enumerate(unusable)]
+    def _choose(self, errors_V: Sequence[float], scored: float) -> None:
+        """Choose the champion by the rms errors (k,), V, after ``scored`` more samples."""
         before = self._choice.champion
-        why = self._choice.choose(errors_V, scored_s)
+        why = self._choice.choose(errors_V, float(scored) * self._dt_s)
         if why:
-            self._events.append(("champion_changed", self._describe_change(errors_V, before, why)))
-
-    def _describe_change(self, errors_V: Sequence[float], before: int, why: str) -> str:
-        after, old = (
-            f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in (self._choice.champion, before)
-        )
-        return f"{after} is served in place of {old}: {why}"
+            ends = (self._choice.champion, before)
+            new, old = (f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in ends)
+            self._events.append(("champion_changed", f"{new} is served in place of {old}: {why}"))
 
     def _snapshot(self, i: int) -> InverseModel:
         if i == 0:

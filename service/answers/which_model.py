@@ -20,15 +20,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum, StrEnum
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
 from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
-from adaptive.state import Entry, restore
-from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
+from adaptive.state import Entry
+from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STAND_IN
@@ -126,29 +125,23 @@ ROLES: Final = ("good", "mark", "next_mark")
 _SWEEP: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9, 1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
 
 
-@dataclass(frozen=True, slots=True)
-class ChoiceConfig:
-    """Times and limits of the choice.
-
-    Attributes
-    ----------
-    insane_share : distance from the identified model, as a share of the voltage range, that no drift explains.
-    recover_s : time without a trouble, s, after which it is over.
-    mark_s : age, s, from which a model counts as one from before the trouble.
-    unseen_s : time, s, in which a wrong voltage may still be too near the commanded one to be noticed.
-    last_good_s, ramp_s : times, s, for which a trouble leaves the trust at 1, and in which it then goes to 0.
-    """
-
-    insane_share: float = 1.0
-    recover_s: float = 0.5
-    mark_s: float = 0.5
-    unseen_s: float = 0.1
-    last_good_s: float = 60.0
-    ramp_s: float = 1.0
+#: Distance from the identified model, as a share of the voltage range, that no drift explains.
+INSANE_SHARE: Final = 1.0
+#: Time without a sign of a trouble after which it is over, s.
+RECOVER_S: Final = 0.5
+#: Age from which a model counts as one from before a trouble; and time in which a wrong voltage may still be too near
+#: the commanded one to be noticed, s.
+MARK_S, UNSEEN_S = 0.5, 0.1
+#: Time in which the trust goes to 0 once a trouble has lasted for ``last_good_s``, and comes back, s.
+RAMP_S: Final = 1.0
 
 
 class ModelChoice:
     """Which model of a learner is served, and how far it is trusted. One thread calls it.
+
+    Parameters
+    ----------
+    dt_s : sample time, s. limits : of the axis. last_good_s : time for which a trouble leaves the trust at 1, s.
 
     Attributes
     ----------
@@ -163,10 +156,9 @@ class ModelChoice:
     _clean: Annotated[int, Entry("samples without a sign of it", low=0)]
     _marked: Annotated[int, Entry("samples when the newer model from before was kept", low=0)]
 
-    def __init__(self, config: ChoiceConfig, dt_s: float, limits: Limits) -> None:
-        self.config = config
+    def __init__(self, dt_s: float, limits: Limits, last_good_s: float) -> None:
         self.trouble, self.trust = "", 1.0
-        self._dt_s, self._limits = dt_s, limits
+        self._dt_s, self._limits, self._last_good_s = dt_s, limits, last_good_s
         # The good models: newest, and two marks of which the older one is at least ``mark_s`` old.
         self.good: InverseModel | None = None
         self._mark: InverseModel | None = None
@@ -189,7 +181,6 @@ class ModelChoice:
         learner has the sensor on trial.
         """
         elapsed, self._seen = now - self._seen, now
-        c = self.config
         if rule_of(found).kept is Kept.NEWEST:
             found = self._trouble_of_model(candidate, identified) or found
         if found:
@@ -198,7 +189,7 @@ class ModelChoice:
                 self._enter(found, now)
         elif self.trouble:
             self._clean += elapsed
-            if self._clean * self._dt_s >= c.recover_s:
+            if self._clean * self._dt_s >= RECOVER_S:
                 self.trouble = ""
         if candidate is not None:
             # On trial the learner has itself gone back to before the fault, which is better than an old snapshot.
@@ -207,10 +198,10 @@ class ModelChoice:
                 self.good = candidate
             if self.rule.answers is Answering.IDENTIFIED:
                 self._mark = self._next_mark = candidate
-            elif not self.trouble and (self._mark is None or (now - self._marked) * self._dt_s >= c.mark_s):
+            elif not self.trouble and (self._mark is None or (now - self._marked) * self._dt_s >= MARK_S):
                 self._mark, self._next_mark, self._marked = self._next_mark or candidate, candidate, now
-        old = bool(self.trouble) and (now - self._since) * self._dt_s > c.last_good_s
-        step = elapsed * self._dt_s / c.ramp_s
+        old = bool(self.trouble) and (now - self._since) * self._dt_s > self._last_good_s
+        step = elapsed * self._dt_s / RAMP_S
         self.trust = max(0.0, self.trust - step) if old else min(1.0, self.trust + step)
         return self.good
 
@@ -222,7 +213,7 @@ class ModelChoice:
         if kept is Kept.OLDER and self._mark is not None:
             self.good = self._next_mark = self._mark
         if kept is Kept.NEWER and self._mark is not None:
-            fresh = (now - self._marked) * self._dt_s < self.config.unseen_s
+            fresh = (now - self._marked) * self._dt_s < UNSEEN_S
             self.good = self._mark if fresh or self._next_mark is None else self._next_mark
 
     def _trouble_of_model(self, candidate: InverseModel | None, identified: InverseModel | None) -> str:
@@ -248,20 +239,17 @@ class ModelChoice:
         if identified is None:
             return True
         apart_V = np.abs(u - voltages_along(identified, y))
-        most_V = self.config.insane_share * (limits.u_max_V - limits.u_min_V)
+        most_V = INSANE_SHARE * (limits.u_max_V - limits.u_min_V)
         return bool((apart_V[np.isfinite(apart_V)] <= most_V).all())
 
     def models(self) -> dict[str, InverseModel]:
-        """The models that are kept, by role; `restored` takes them back."""
+        """The models that are kept, by role; `keep` takes them back."""
         known = zip(ROLES, (self.good, self._mark, self._next_mark), strict=True)
         return {role: model for role, model in known if model is not None}
 
-    def restored(self, state: StateDict, models: dict[str, InverseModel]) -> ModelChoice:
-        """A choice like this one that continues from its saved state and ``models``. Raises ModelFileError."""
-        made = ModelChoice(self.config, self._dt_s, self._limits)
-        restore(made, state)
-        made.good, made._mark, made._next_mark = (models.get(role) for role in ROLES)
-        return made
+    def keep(self, models: Mapping[str, InverseModel]) -> None:
+        """Continue with the kept ``models`` of a saved choice, by role."""
+        self.good, self._mark, self._next_mark = (models.get(role) for role in ROLES)
 
 
 def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
@@ -454,10 +442,10 @@ While the readings are on trial, what the learner itself has gone back to is ser
 
 def page() -> str:
     """The page in Markdown."""
-    c, says = ChoiceConfig(), {True: "yes", False: "no"}
+    says = {True: "yes", False: "no"}
     return _PAGE.format(
-        recover_s=c.recover_s,
-        ramp_s=c.ramp_s,
+        recover_s=RECOVER_S,
+        ramp_s=RAMP_S,
         models="\n".join(f"| `{answers}` | {text} |" for answers, text in MODELS.items()),
         rows="\n".join(f"| {row.when} | `{row.answers}` |" for row in ROWS),
         rules="\n".join(

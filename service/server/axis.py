@@ -28,8 +28,6 @@ from service.answers.guard import Limits
 from service.answers.slices import Pace
 from service.answers.which_model import (
     Answering,
-    ChoiceConfig,
-    ModelChoice,
     Seen,
     answering,
     is_identified,
@@ -50,8 +48,6 @@ from service.server.learner_supervisor import (
     UNUSABLE,
     LearnerSupervisor,
     Revive,
-    SampleWatch,
-    SampleWatchConfig,
     blend_share_of,
     champion_of,
     stored_model,
@@ -259,9 +255,9 @@ class Axis:
         self.clock = SampleClock(self.dt_s)
         self.tracker = MemoryTracker(self.dt_s)
         self.witness = CommandWitness(limits.u_max_V - limits.u_min_V)
-        watch = SampleWatch(SampleWatchConfig(), self.dt_s, limits.u_max_V - limits.u_min_V)
-        choice = ModelChoice(ChoiceConfig(last_good_s=config.last_good_s), self.dt_s, limits)
-        self.supervisor = LearnerSupervisor(config.learn, learner, watch, choice, self.dt_s, self.note, revive)
+        self.supervisor = LearnerSupervisor(
+            config.learn, learner, limits, config.last_good_s, self.dt_s, self.note, revive
+        )
         #: What moves between two snapshots, for followers.
         self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.

@@ -35,6 +35,7 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateD
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition, check_like
 from service.answers.answering import Served
+from service.answers.guard import Limits
 from service.answers.which_model import (
     LEARNER_FAILED,
     MODELS,
@@ -75,23 +76,13 @@ _WIDEN: Final = {
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
 
 
-@dataclass(frozen=True, slots=True)
-class SampleWatchConfig:
-    """Thresholds of the troubles.
-
-    Attributes
-    ----------
-    frozen_s, frozen_share : the sensor is frozen if the reading does not change for this time, s, while the voltage
-    changes by this share of its range.
-    poisoned_s, poisoned_share : time constant, s, and share of bad values from which samples are poisoned.
-    silent_s : time of refused motion without a sample that is learnt, s, after which that is a trouble.
-    """
-
-    frozen_s: float = 0.1
-    frozen_share: float = 0.02
-    poisoned_s: float = 0.25
-    poisoned_share: float = 0.5
-    silent_s: float = 0.5
+#: The sensor is frozen if the reading does not change for this time, s, while the voltage moves by this share of its
+#: range. No less motion counts as such.
+FROZEN_S, MOVES_SHARE = 0.1, 0.02
+#: Time constant, s, and share of bad values from which samples are poisoned; and the share at which that ends.
+POISONED_S, POISONED_SHARE, CLEAN_SHARE = 0.25, 0.5, 0.1
+#: Time of refused motion after which that is a trouble, s.
+SILENT_S: Final = 0.5
 
 
 @dataclass(slots=True)
@@ -121,8 +112,7 @@ class SampleWatch:
     _bad: Annotated[float, Entry("share of bad readings of late")]
     _gate: Annotated[str, Entry("gate that refused the last sample in motion", most=1000)]
 
-    def __init__(self, config: SampleWatchConfig, dt_s: float, span_V: float) -> None:
-        self.config = config
+    def __init__(self, dt_s: float, span_V: float) -> None:
         self._dt_s, self._span_V = dt_s, span_V
         self.count, self._y_um, self._bad, self._gate = 0, math.nan, 0.0, ""
         self._still, self._silent = Run(), Run()
@@ -137,35 +127,25 @@ class SampleWatch:
             self._gate = verdict
         # A repeated reading belongs to the trouble sensor_frozen.
         bad = 1.0 if verdict in _BAD_VALUES and not self._still.count else 0.0
-        self._bad += (bad - self._bad) * self._dt_s / self.config.poisoned_s
+        self._bad += (bad - self._bad) * self._dt_s / POISONED_S
 
     def trouble(self, now: str) -> str:
         """Name of what is wrong with the samples, "" for nothing; ``now`` : the present trouble."""
-        c = self.config
-        # Hysteresis: a lower share ends the trouble than begins it.
-        share = c.poisoned_share * (0.2 if now == SAMPLES_POISONED else 1.0)
-        if self._bad > share:
+        if self._bad > (CLEAN_SHARE if now == SAMPLES_POISONED else POISONED_SHARE):
             return SAMPLES_POISONED
-        if self._lasts(self._still, c.frozen_s):
+        if self._lasts(self._still, FROZEN_S):
             return SENSOR_FROZEN
         # What another trouble refuses is no news.
-        return NOTHING_LEARNT if now in ("", NOTHING_LEARNT) and self._lasts(self._silent, c.silent_s) else ""
+        return NOTHING_LEARNT if now in ("", NOTHING_LEARNT) and self._lasts(self._silent, SILENT_S) else ""
 
     def _lasts(self, run: Run, least_s: float) -> bool:
         moved_V = run.high_V - run.low_V
-        return run.count * self._dt_s >= least_s and moved_V >= self.config.frozen_share * self._span_V
+        return run.count * self._dt_s >= least_s and moved_V >= MOVES_SHARE * self._span_V
 
     @property
     def why_nothing(self) -> str:
         """The reason for ``nothing_learnt`` in words."""
-        silent_s = self.config.silent_s
-        return f"no sample for {silent_s:g} s, the last one refused as {self._gate}; the next that passes ends it"
-
-    def restored(self, state: StateDict) -> SampleWatch:
-        """A watch like this one that continues from its saved state. Raises ModelFileError."""
-        made = SampleWatch(self.config, self._dt_s, self._span_V)
-        restore(made, state)
-        return made
+        return f"no sample for {SILENT_S:g} s, the last one refused as {self._gate}; the next that passes ends it"
 
 
 # --- Stored states of a learner.
@@ -276,28 +256,32 @@ class LearnerSupervisor:
     ----------
     name : of the model that learns; "" for none.
     learner : None for an axis that does not learn.
-    watch : finds what is wrong with the samples.
-    choice : decides which model is served, and whether samples are learnt.
+    limits : of the axis. last_good_s : time for which a model from before a trouble is trusted, s.
     dt_s : sample time, s. note : tells events.
     revive : starts another learner `REVIVE_S` after this one has failed; None: it stays failed.
+
+    Attributes
+    ----------
+    watch : finds what is wrong with the samples.
+    choice : decides which model is served, and whether samples are learnt.
     """
 
     def __init__(
         self,
         name: str,
         learner: OnlineModel | None,
-        watch: SampleWatch,
-        choice: ModelChoice,
+        limits: Limits,
+        last_good_s: float,
         dt_s: float,
         note: Note,
         revive: Revive | None,
     ) -> None:
         self.name = name
         self.learner = learner
-        self.watch = watch
-        self.choice = choice
+        self.watch = SampleWatch(dt_s, limits.u_max_V - limits.u_min_V)
+        self.choice = ModelChoice(dt_s, limits, last_good_s)
         self.adoptions = Adoptions()
-        self._dt_s = dt_s
+        self._limits, self._last_good_s, self._dt_s = limits, last_good_s, dt_s
         self._note = note
         self._revive = revive
         self._failed = False
@@ -442,15 +426,17 @@ class LearnerSupervisor:
             with part_of(rest, f"model.{role}.") as kept:
                 if kept and learner is not None:
                     models[role] = stored_model(kept, learner.snapshot(), f"the {role} model")
-        with part_of(rest, "watch.") as kept:
-            watch = self.watch.restored(kept)
-        with part_of(rest, "choice.") as kept:
-            choice = self.choice.restored(kept, models)
+        made = LearnerSupervisor(
+            self.name, learner, self._limits, self._last_good_s, self._dt_s, self._note, self._revive
+        )
+        for name, part in (("watch.", made.watch), ("choice.", made.choice)):
+            with part_of(rest, name) as kept:
+                restore(part, kept)
+        made.choice.keep(models)
         with part_of(rest, "mark.") as mark:
             if mark and self.learner is not None:
                 restored_learner(mark, self.learner)
         own = load(SupervisorEntries, rest)
-        made = LearnerSupervisor(self.name, learner, watch, choice, self._dt_s, self._note, self._revive)
         made._frozen_by, made._failed, made._failed_at = own.frozen_by, own.dead, own.dead_at
         made.adoptions.add(*(Retuned.from_json(entry, "adoptions") for entry in json.loads(own.adoptions)))
         made._marks, made._marked = (mark, {}), received

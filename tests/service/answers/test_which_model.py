@@ -12,7 +12,7 @@ import pytest
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import SENSOR_FAULTS
-from adaptive.state import save
+from adaptive.state import restore, save
 from adaptive.types import InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits
@@ -21,7 +21,6 @@ from service.answers.which_model import (
     ROWS,
     RULES,
     Answering,
-    ChoiceConfig,
     ModelChoice,
     Seen,
     answering,
@@ -111,7 +110,7 @@ class Life:
     """Snapshots one after the other; each brings another model."""
 
     def __init__(self) -> None:
-        self.choice = ModelChoice(ChoiceConfig(last_good_s=2.0), DT_S, LIMITS)
+        self.choice = ModelChoice(DT_S, LIMITS, last_good_s=2.0)
         self.number = 0
         self.newest: InverseModel | None = None
 
@@ -201,7 +200,8 @@ def test_a_state_goes_on_alike() -> None:
     life.go(20, "sensor_stuck")
     other = Life()
     other.number = life.number
-    other.choice = other.choice.restored(save(life.choice), life.choice.models())
+    restore(other.choice, save(life.choice))
+    other.choice.keep(life.choice.models())
     assert [life.go(30), life.choice.trust] == [other.go(30), other.choice.trust]
 
 

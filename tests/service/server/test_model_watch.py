@@ -26,7 +26,7 @@ from service.protocol.query import STAND_IN, FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_supervisor import UNUSABLE, SampleWatch, SampleWatchConfig
+from service.server.learner_supervisor import UNUSABLE, SampleWatch
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import SmoothingLearner
 from tests.service.conftest import DT_S, make_models
@@ -125,7 +125,7 @@ def test_half_a_second_of_motion_without_an_accepted_sample_is_a_trouble(
     swing: float, learns: bool, verdict: str, at_s: float | None
 ) -> None:
     """And neither is rest, nor a motion of which a sample is learnt now and then, nor the time after missing ones."""
-    watch = SampleWatch(SampleWatchConfig(), DT_S, 10.0)
+    watch = SampleWatch(DT_S, 10.0)
     found: list[float] = []
     for k in range(1000):
         u_V = 5.0 + 10.0 * swing * math.sin(2.0 * math.pi * 3.0 * k * DT_S)
