@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from adaptive.online.learner import Learner, Parts
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -90,3 +91,13 @@ class PlainLearner(PlainModel):
 
     def state_dict(self) -> StateDict:
         return self.inner.state_dict()
+
+
+class SmoothingLearner(PlainLearner):
+    """The same for a learner that competes: the motion is that of ``inner``."""
+
+    inner: Learner
+
+    @property
+    def parts(self) -> Parts:
+        return self.inner.parts

@@ -4,9 +4,9 @@ Every contestant is scored on fresh samples (`Judge`). The champion is replaced 
 contestant that has been clearly better for a while (`ChampionChoice`), and callers pass to the
 new champion without a jump (`baselines.competition.champion`).
 
-The first contestant is the favourite. Its verdicts on samples are those of the competition, it is the first champion,
-and it becomes champion again as soon as it is no worse. A contestant that raises leaves the competition and the others
-go on; the favourite can start anew from its last snapshot.
+The first contestant is the favourite, a learner. Its verdicts on samples are those of the competition: all are scored
+on the motion that it smooths, where it accepts that. It is the first champion, and becomes champion again as soon as it
+is no worse. Another contestant that raises leaves the competition; what the favourite raises, ``handle`` raises.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from adaptive.errors import InputError, ModelFileError
+from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
-from adaptive.online.learner import Learner
-from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
+from adaptive.online.learner import Learner, Parts
 from adaptive.state import Entry, Refused, load, part_of, restore, save
 from adaptive.types import (
     FloatArray,
@@ -41,20 +40,27 @@ from baselines.bouc_wen.online import BoucWenOnline
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.config import CompetitionConfig
 from baselines.linear import LinearInverse, LinearOnline
-from baselines.online_baseline import OnlineBaseline
 from baselines.prandtl_ishlinskii.model import MpiInverse
 from baselines.prandtl_ishlinskii.online import MpiOnline
 
-# --- Which online models can compete, how a stored state names them, and how an identified baseline starts one.
+# --- Which online models can compete, and how an identified baseline starts one.
 
-#: Makes a new online model from the last snapshot of one that has failed.
-Restart = Callable[[InverseModel], OnlineModel]
-#: Class of a contestant by the name that stored states use.
-_ONLINE_KINDS: Final[dict[str, type[Learner] | type[OnlineBaseline]]] = {
-    "learner": Learner,
-    "linear": LinearOnline,
-    "mpi": MpiOnline,
-    "bouc_wen": BoucWenOnline,
+
+@runtime_checkable
+class Smooths(Protocol):
+    """A learner that smooths the motion and judges the samples: the favourite."""
+
+    @property
+    def parts(self) -> Parts:
+        """Its changing state."""
+        ...
+
+
+#: How each kind of baseline learns.
+_ONLINE_FORMS: Final[dict[type, Callable[[Any], OnlineModel]]] = {
+    LinearInverse: LinearOnline,
+    MpiInverse: MpiOnline,
+    BoucWenInverse: BoucWenOnline,
 }
 #: Inverse models whose stated deviation is that of a fit, not of served answers.
 _BASELINES = (LinearInverse, MpiInverse, BoucWenInverse)
@@ -62,13 +68,8 @@ _BASELINES = (LinearInverse, MpiInverse, BoucWenInverse)
 
 def online_form(model: InverseModel) -> OnlineModel | None:
     """A new online model that starts from an identified baseline; None where the model has no online form."""
-    if isinstance(model, LinearInverse):
-        return LinearOnline(model)
-    if isinstance(model, MpiInverse):
-        return MpiOnline(model)
-    if isinstance(model, BoucWenInverse):
-        return BoucWenOnline(model)
-    return None
+    form = _ONLINE_FORMS.get(type(model))
+    return None if form is None else form(model)
 
 
 def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseModel:
@@ -86,108 +87,12 @@ def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseMode
 # --- Scores of a competition: the voltage each contestant would have answered, against the voltage that was applied.
 #
 # A contestant is scored by the snapshot that callers had when the motion happened (``serving_age_s`` old), so the
-# scored samples have not taught it. Displacement, velocity and acceleration come from the fixed-lag smoother. Only
-# motion is scored, because every model predicts a stage at rest.
+# scored samples have not taught it. Displacement, velocity, acceleration and voltage are those that the favourite has
+# smoothed. Only motion is scored that it accepts: what its judge refuses says nothing of a model, and every model
+# predicts a stage at rest.
 
-#: Verdicts on a sample that exclude it from scoring.
-_NOT_SCORED: Final = frozenset(
-    {gates.GLITCH, gates.RINGING, gates.UNTRUSTED, gates.SATURATED, gates.OUT_OF_RANGE, gates.SETTLING, gates.GAP}
-)
-#: Sample time up to which ``glitch_share`` is used as given, s; it grows in proportion to longer ones.
-_GLITCH_DT_S = 1e-3
-#: Most missing samples that the smoother bridges; after more it restarts.
-_MAX_GAP = 5
-#: Readings in a row that may differ from the prediction as glitches; after more the stage is taken to have moved.
-_MAX_GLITCHES = 3
-
-
-class _SmoothedMotion:
-    """Collects the smoothed motion with the voltage of the same instant, and marks the samples that are scored."""
-
-    _state: Annotated[SmootherState | None, Entry("state of the smoother", name="smoother")]
-    _u: Annotated[deque[float], Entry("voltages over the lag", "V", most=20_000)]
-    _rows: Annotated[
-        list[tuple[float, float, float, float, float]],
-        Entry("motion, voltage, and whether it is scored", "µm, µm/s, µm/s², V", "*,5"),
-    ]
-    _glitches: Annotated[int, Entry("readings in a row far from the prediction", low=0)]
-    _since_start: Annotated[int, Entry("samples since the smoother started", low=0)]
-    _since_left: Annotated[int, Entry("samples since the stage left a place", low=0)]
-    _anchor_um: Annotated[float, Entry("that place", "µm")]
-
-    def __init__(self, config: CompetitionConfig, dt_s: float, range_um: float) -> None:
-        self._config = config
-        self._dt_s = dt_s
-        self._rest_um = config.rest_share * range_um
-        self._rest_samples = config.rest_s / dt_s
-        self._glitch_um = config.glitch_share * range_um * max(1.0, dt_s / _GLITCH_DT_S)
-        self._smoother = FixedLagSmoother(SmootherConfig.for_rate(dt_s, config.cutoff_hz))
-        self.lag = self._smoother.config.lag
-        self._state = None
-        self._u = deque(maxlen=self.lag + 1)
-        self._rows = []
-        self._glitches = 0
-        self._since_start = 0
-        self._since_left = 0
-        self._anchor_um = 0.0
-
-    def take(self, sample: Sample, missing: int, counts: bool) -> None:
-        """Take a good sample that follows ``missing`` lost ones; ``counts``: its verdict allows scoring."""
-        state = self._state
-        if state is None or missing > _MAX_GAP:
-            self._restart(sample.y_um)
-            state = self._state
-        else:
-            for _ in range(missing):
-                self._step(state, None, self._u[-1], False)
-        assert state is not None
-        if abs(sample.y_um - float(state.x[0])) > self._glitch_um and self._since_start > self.lag:
-            self._glitches += 1
-            if self._glitches <= _MAX_GLITCHES:
-                self._step(state, None, sample.u_V, False)
-                return
-            self._restart(sample.y_um)
-            state = self._state
-            assert state is not None
-        self._glitches = 0
-        self._step(state, sample.y_um, sample.u_V, counts)
-
-    def _restart(self, y_um: float) -> None:
-        self._state = self._smoother.initial_state(y_um)
-        self._u.clear()
-        self._since_start = self._since_left = 0
-        self._glitches = 0
-        self._anchor_um = y_um
-
-    def _step(self, state: SmootherState, y_um: float | None, u_V: float, counts: bool) -> None:
-        self._u.append(u_V)
-        self._since_start += 1
-        motion = self._smoother.skip(state) if y_um is None else self._smoother.step(state, y_um)
-        if motion is None:
-            return
-        y, v, a = motion
-        if abs(y - self._anchor_um) > self._rest_um:
-            self._anchor_um, self._since_left = y, 0
-        else:
-            self._since_left += 1
-        scored = counts and self._since_start > self._config.settle and self._since_left <= self._rest_samples
-        self._rows.append((y, v, a, self._u[0], float(scored)))
-
-    def block(self) -> FloatArray:
-        """(5, n) rows y µm, v µm/s, a µm/s², u V, scored (0 or 1) of the motion since the last call."""
-        rows = np.ascontiguousarray(np.array(self._rows, dtype=np.float64).reshape(-1, 5).T)
-        self._rows.clear()
-        return rows
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Names of the dimensions of the state."""
-        return self._smoother.sizes
-
-    def check_state(self, values: dict[str, Any]) -> None:
-        """Raise ValueError where there is a smoother without a voltage."""
-        if values["_state"] is not None and not values["_u"]:
-            raise ValueError("u: got no voltage, expected those over the lag")
+#: Verdicts of the favourite on samples that are scored.
+_SCORED: Final = frozenset({gates.LEARNT, gates.PASSED, gates.REDUNDANT, gates.OUTLIER, gates.FROZEN})
 
 
 @dataclass(slots=True)
@@ -240,11 +145,10 @@ class Judge:
 
     def __init__(self, config: CompetitionConfig, start: Snapshots, lag: int, span_V: float) -> None:
         self._config, self._dt_s, self._lag, self._span_V = config, start[0].dt_s, lag, span_V
-        self._start = start
         self.scores = [_RunningError(np.empty(0)) for _ in start]
         # (sequence number, snapshots) at the last blocks, back to the age of an answer.
         depth = math.ceil((config.serving_age_s / self._dt_s + lag) / config.block) + 2
-        self._past: deque[tuple[int, Snapshots]] = deque(maxlen=depth)
+        self._past: deque[tuple[int, Snapshots]] = deque([(-1, start)], depth)
 
     def rms_V(self, i: int) -> float:
         """rms error of contestant ``i``, V; 0 before the first scored sample."""
@@ -274,18 +178,19 @@ class Judge:
             if tracked is not None:
                 score.memory = tracked
 
+    @property
+    def newest(self) -> Snapshots:
+        """The snapshots at the last block."""
+        return self._past[-1][1]
+
     def remember(self, seq: int, snapshots: Snapshots) -> None:
         """Keep the snapshots that callers have from sample ``seq`` on."""
         self._past.append((seq, snapshots))
 
-    def begin_anew(self, i: int) -> None:
-        """Reset the score of contestant ``i`` to the worst value, which new samples soon replace."""
-        self.scores[i] = _RunningError(np.empty(0), self._span_V**2, 1.0)
-
     def _served_then(self, seq: int, count: int) -> Snapshots:
         """The snapshots that were ``serving_age_s`` old at the first instant of a block of ``count`` samples."""
         oldest = seq - self._lag - count + 1 - round(self._config.serving_age_s / self._dt_s)
-        served = self._past[0][1] if self._past else self._start
+        served = self._past[0][1]
         for at, snapshots in self._past:
             if at <= oldest:
                 served = snapshots
@@ -294,10 +199,9 @@ class Judge:
     def state_dict(self, names: tuple[str, ...]) -> StateDict:
         """The whole state of the contestants ``names`` as flat entries; copies."""
         state: StateDict = {"past_seq": np.array([seq for seq, _ in self._past], dtype=np.int64)}
-        kept = {"start": self._start} | {f"past{k}": snapshots for k, (_, snapshots) in enumerate(self._past)}
-        for where, snapshots in kept.items():
+        for k, (_, snapshots) in enumerate(self._past):
             # A stored champion model holds the snapshots; its champion has no meaning here.
-            state |= prefixed(f"{where}.", ChampionInverse(names, snapshots, 0).state_dict())
+            state |= prefixed(f"past{k}.", ChampionInverse(names, snapshots, 0).state_dict())
         for name, score in zip(names, self.scores, strict=True):
             state |= prefixed(f"score.{name}.", save(score))
         return state
@@ -305,10 +209,9 @@ class Judge:
     def restore(self, names: tuple[str, ...], state: StateDict) -> None:
         """Continue from a ``state_dict``. Raises ModelFileError where it does not fit; entries are taken out."""
         seqs = state.pop("past_seq", None)
-        if not isinstance(seqs, np.ndarray) or seqs.dtype != np.int64 or seqs.shape > (self._past.maxlen or 0,):
-            raise Refused("past_seq", repr(seqs)[:80], f"up to {self._past.maxlen} integers")
-        like = self._start
-        self._start = snapshots_of(state, "start", names, like)
+        if not isinstance(seqs, np.ndarray) or seqs.dtype != np.int64 or not (1,) <= seqs.shape <= (self._past.maxlen,):
+            raise Refused("past_seq", repr(seqs)[:80], f"1 to {self._past.maxlen} integers")
+        like = self.newest
         past = [(seq, snapshots_of(state, f"past{k}", names, like)) for k, seq in enumerate(seqs.tolist())]
         self._past.clear()
         self._past.extend(past)
@@ -391,50 +294,46 @@ class Competition:
 
     Parameters
     ----------
-    contestants : online models by name, all of one sample time; the first is the favourite.
-    range_um, span_V : displacement range and voltage range of the identification.
-    restart : makes the favourite anew from its last snapshot, ``revive_s`` after it has raised. None: it stays out.
+    contestants : online models by name, all of one sample time; the first is the favourite, which smooths the motion.
+    span_V : voltage range of the identification.
 
-    Raises InputError where there is no contestant or a range is not positive.
+    Raises InputError where the first contestant is no learner or the range is not positive.
     """
 
-    _range_um: Annotated[float, Entry("displacement range of the identification", "µm")]
-    _span_V: Annotated[float, Entry("its voltage range", "V")]
     _seq: Annotated[int, Entry("number of the last sample, -1 before any", low=-1)]
     _frozen: Annotated[bool, Entry("whether learning is stopped")]
-    _failed_seq: Annotated[int, Entry("sample at which the favourite failed or was restarted, -1 for none", low=-1)]
     _choice: Annotated[ChampionChoice, Entry("the choice of a champion", name="")]
     _out: Annotated[list[bool], Entry("which contestants have failed", "", "contestants")]
-    _motion: Annotated[_SmoothedMotion, Entry("smoothed motion on which the contestants are scored")]
+    _rows: Annotated[
+        list[tuple[float, float, float, float, float]],
+        Entry("motion since the last block, its voltage, and whether it is scored", "µm, µm/s, µm/s², V", "*,5"),
+    ]
+    _last: Annotated[int, Entry("number of the last smoothed instant, -1 for none", low=-1)]
 
     def __init__(
-        self,
-        contestants: dict[str, OnlineModel],
-        range_um: float,
-        span_V: float,
-        config: CompetitionConfig | None = None,
-        restart: Restart | None = None,
+        self, contestants: dict[str, OnlineModel], span_V: float, config: CompetitionConfig | None = None
     ) -> None:
-        if not contestants or not (range_um > 0.0 and span_V > 0.0):
+        favourite: object = next(iter(contestants.values()), None)
+        if not isinstance(favourite, Smooths) or not span_V > 0.0:
             raise InputError(
-                f"contestants, range_um, span_V: got {len(contestants)}, {range_um}, {span_V}, expected all positive"
+                f"contestants, span_V: got {type(favourite).__name__} first, {span_V}, expected a learner and a range"
             )
         self.config = config or CompetitionConfig()
         self.names = tuple(contestants)
         self._models = list(contestants.values())
+        self._smooths: Smooths = favourite
         first = tuple(model.snapshot() for model in self._models)
-        self._dt_s, self._range_um, self._span_V = first[0].dt_s, range_um, span_V
-        self._motion = _SmoothedMotion(self.config, self._dt_s, range_um)
-        self.judge = Judge(self.config, first, self._motion.lag, span_V)
+        self._dt_s, self._span_V = first[0].dt_s, span_V
+        self.judge = Judge(self.config, first, favourite.parts.intake.smoother.config.lag, span_V)
         self._choice = ChampionChoice(self.config, span_V)
         self._newest = first
         self._serving = ChampionInverse(self.names, first, 0, self.config.blend_s)
         self._out = [False] * len(first)
-        self._seq = -1
+        self._seq = self._last = -1
+        self._rows = []
         self._frozen = False
         # Whether a contestant may have changed since its snapshot was taken.
         self._changed = True
-        self._restart, self._failed_seq = restart, -1
         self._events: deque[tuple[str, str]] = deque(maxlen=64)
 
     @classmethod
@@ -445,11 +344,10 @@ class Competition:
         model: InverseModel,
         others: dict[str, InverseModel],
         config: CompetitionConfig | None = None,
-        restart: Restart | None = None,
     ) -> Competition:
         """``learner``, started from ``model``, against the online forms of ``others``; those without one are left out.
 
-        Raises InputError unless ``model`` is an LSSVM, whose ranges errors are measured by.
+        Raises InputError unless ``model`` is an LSSVM, whose range errors are measured by.
         """
         if not isinstance(model, LssvmInverse):
             raise InputError(f"{favourite}: got a {type(model).__name__}, expected an LSSVM model")
@@ -458,8 +356,7 @@ class Competition:
             online = online_form(other)
             if online is not None and name != favourite:
                 contestants[name] = online
-        range_um = model.features.y_max_um - model.features.y_min_um
-        return cls(contestants, range_um, model.span_V, config, restart)
+        return cls(contestants, model.span_V, config)
 
     @property
     def favourite(self) -> OnlineModel:
@@ -499,29 +396,35 @@ class Competition:
     # ---- samples in
 
     def handle(self, sample: Sample) -> str:
-        """Give a sample to every contestant. Returns the verdict of the first contestant that is still in.
-
-        Raises the error of the last contestant where none is left.
-        """
-        verdict, seq, self._changed = "", self._seq, True
+        """Give a sample to every contestant; returns the favourite's verdict. Raises what the favourite raises."""
+        self._changed = True
+        verdict = self.favourite.handle(sample)
+        before, self._seq = self._seq, self.favourite.seq
+        # While frozen, the favourite still judges and tracks; the others would only learn.
         for i, model in enumerate(self._models):
-            # While frozen, one contestant still judges and tracks; the others would only learn.
-            if self._out[i] or (self._frozen and i and verdict):
-                continue
-            try:
-                said, now = model.handle(sample), model.seq
-            except Exception as error:
-                self._exclude(i, error)
-                continue
-            if not verdict:
-                verdict, seq = said, now
-        before, self._seq = self._seq, seq
-        if seq == before:
+            if i and not (self._out[i] or self._frozen):
+                try:
+                    model.handle(sample)
+                except Exception as error:
+                    self._exclude(i, error)
+        if self._seq == before:
             return verdict
-        self._motion.take(sample, max(0, seq - before - 1) if before >= 0 else 0, verdict not in _NOT_SCORED)
-        if seq // self.config.block > before // self.config.block:
+        self._take_motion(verdict)
+        if self._seq // self.config.block > before // self.config.block:
             self._judge_block()
         return verdict
+
+    def _take_motion(self, verdict: str) -> None:
+        """Take the instant that the favourite has just smoothed, if there is one; none while it holds readings."""
+        parts = self._smooths.parts
+        gates, track = parts.intake.gates, parts.intake.track
+        pair = None if track is None else track.pair()
+        if track is None or pair is None or pair.now == self._last:
+            return
+        self._last = pair.now
+        moves = (track.state.count - gates.moved) * self._dt_s <= parts.config.admission.rest_s
+        scored = verdict in _SCORED and moves
+        self._rows.append((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2, pair.u_V, float(scored)))
 
     def window_data(self) -> WindowData | None:
         """The samples of the favourite, to tune its hyper-parameters on."""
@@ -542,11 +445,6 @@ class Competition:
         self._frozen, self._changed = False, True
         self.favourite.thaw()
 
-    @property
-    def frozen(self) -> bool:
-        """Whether learning is stopped."""
-        return self._frozen
-
     def resync(self) -> None:
         """Accept the next sample whatever its sequence number, because the stage has restarted."""
         for model in self._models:
@@ -562,65 +460,44 @@ class Competition:
                 mine.resync()
             else:
                 mine.take_place_of(its)
+        self._rows, self._last = [], -1
 
     def _exclude(self, i: int, error: Exception) -> None:
         self._out[i] = True
-        if i == 0:
-            self._failed_seq = self._seq
-        name = "contestant_failed" if i else "learner_failed"
-        self._events.append((name, f"{self.names[i]}: {type(error).__name__}: {error}; the others go on"))
-        if all(self._out):
-            raise error
+        detail = f"{self.names[i]}: {type(error).__name__}: {error}; the others go on"
+        self._events.append(("contestant_failed", detail))
 
     def _judge_block(self) -> None:
         """Score the block of motion that has passed, then choose the champion."""
-        rows = self._motion.block()
-        self._restart_favourite()
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, 5).T.copy()
+        self._rows = []
         self._newest = tuple(self._snapshot(i) for i in range(len(self._models)))
         unusable = self.judge.score(self._seq, rows, self._out)
         self.judge.adopt_tracked_memories(self._models, self._newest)
         self.judge.remember(self._seq, self._newest)
         if not self._frozen:
-            self._choose(unusable, float(rows[4].sum()) * self._dt_s)
+            self._choose([math.inf if bad else self.judge.rms_V(i) for i, bad in enumerate(unusable)], rows[4].sum())
         self._serving = self._served()
         self._changed = False
 
-    def _choose(self, unusable: list[bool], scored_s: float) -> None:
-        errors_V = [math.inf if bad else self.judge.rms_V(i) for i, bad in enumerate(unusable)]
+    def _choose(self, errors_V: Sequence[float], scored: float) -> None:
+        """Choose the champion by the rms errors (k,), V, after ``scored`` more samples."""
         before = self._choice.champion
-        why = self._choice.choose(errors_V, scored_s)
+        why = self._choice.choose(errors_V, float(scored) * self._dt_s)
         if why:
-            self._events.append(("champion_changed", self._describe_change(errors_V, before, why)))
-
-    def _describe_change(self, errors_V: Sequence[float], before: int, why: str) -> str:
-        after, old = (
-            f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in (self._choice.champion, before)
-        )
-        return f"{after} is served in place of {old}: {why}"
+            ends = (self._choice.champion, before)
+            new, old = (f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in ends)
+            self._events.append(("champion_changed", f"{new} is served in place of {old}: {why}"))
 
     def _snapshot(self, i: int) -> InverseModel:
+        if i == 0:
+            return self.favourite.snapshot()
         if not self._out[i]:
             try:
                 return self._models[i].snapshot()
             except Exception as error:
                 self._exclude(i, error)
         return self._newest[i]
-
-    def _restart_favourite(self) -> None:
-        """Restart a failed favourite from its last snapshot, ``revive_s`` after the failure; its score starts anew."""
-        waited_s = (self._seq - self._failed_seq) * self._dt_s
-        if self._restart is None or not self._out[0] or waited_s < self.config.revive_s:
-            return
-        self._failed_seq = self._seq
-        try:
-            self._models[0] = self._restart(self._newest[0])
-        except Exception as error:
-            self._events.append(("learner_failed", f"{self.names[0]}: restart from its last snapshot: {error}"))
-            return
-        self._out[0] = False
-        self.judge.begin_anew(0)
-        (self.freeze if self._frozen else self.thaw)()
-        self._events.append(("learner_begun_anew", f"{self.names[0]}: from its last snapshot"))
 
     # ---- out
 
@@ -641,7 +518,7 @@ class Competition:
 
     def moving(self) -> MovingPart | None:
         """What has moved in the favourite since its last snapshot."""
-        return None if self._out[0] else self.favourite.moving()
+        return self.favourite.moving()
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """(m,) memory of the favourite for ``model``, a snapshot of the favourite."""
@@ -702,53 +579,29 @@ class Competition:
     # ---- saving and loading
 
     def state_dict(self) -> StateDict:
-        """The whole state as flat entries, all copies; ``from_state`` continues to the same last bit.
-
-        Raises InputError where a contestant is of a class that cannot be stored.
-        """
-        state: StateDict = {"names": ",".join(self.names), "kinds": self._kinds, **save(self)}
+        """The whole state as flat entries, all copies; ``restored`` continues to the same last bit."""
+        state: StateDict = {"names": ",".join(self.names), **save(self)}
         state |= prefixed("config.", self.config.state_dict())
-        state |= prefixed("newest.", ChampionInverse(self.names, self._newest, 0).state_dict())
         state |= self.judge.state_dict(self.names)
         for name, model in zip(self.names, self._models, strict=True):
             state |= prefixed(f"model.{name}.", model.state_dict())
         return state
 
-    @property
-    def _kinds(self) -> str:
-        kinds: dict[type, str] = {known: kind for kind, known in _ONLINE_KINDS.items()}
-        if any(type(model) not in kinds for model in self._models):
-            raise InputError(f"contestants: expected models of the kinds {', '.join(_ONLINE_KINDS)} to be stored")
-        return ",".join(kinds[type(model)] for model in self._models)
-
     def restored(self, state: StateDict) -> Competition:
-        """A competition with ``state`` that restarts its favourite as this one does. Raises ModelFileError."""
-        for name, own in (("names", ",".join(self.names)), ("kinds", self._kinds)):
-            if state.get(name) != own:
-                raise Refused(name, repr(state.get(name))[:80], repr(own))
-        return self.from_state(state, self._restart)
-
-    @classmethod
-    def from_state(cls, state: StateDict, restart: Restart | None = None) -> Competition:
-        """Inverse of ``state_dict``; ``restart`` as in the constructor.
-
-        Raises ModelFileError where an entry is missing or damaged.
-        """
-        rest = dict(state)
-        names, kinds = str(rest.pop("names", "")).split(","), str(rest.pop("kinds", "")).split(",")
-        if len(set(names)) != len(kinds) or set(kinds) - set(_ONLINE_KINDS):
-            raise Refused("kinds", repr(kinds)[:80], f"one of {', '.join(_ONLINE_KINDS)} for each of {names}"[:200])
-        contestants: dict[str, OnlineModel] = {}
-        for name, kind in zip(names, kinds, strict=True):
+        """A competition of the same contestants and settings with ``state``. Raises ModelFileError."""
+        rest, models = dict(state), dict[str, OnlineModel]()
+        if rest.pop("names", None) != ",".join(self.names):
+            raise Refused("names", repr(state.get("names"))[:80], repr(",".join(self.names)))
+        for name, model in zip(self.names, self._models, strict=True):
             with part_of(rest, f"model.{name}.") as kept:
-                contestants[name] = _ONLINE_KINDS[kind].from_state(kept)
-        try:
-            with part_of(rest, "config.") as settings:
-                config = CompetitionConfig(**settings)
-            made = cls(contestants, float(rest["range_um"]), float(rest["span_V"]), config, restart)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error
-        made._restore(rest)
+                models[name] = model.restored(kept)
+        with part_of(rest, "config."):  # compared by who restores
+            made = Competition(models, self._span_V, self.config)
+        made.judge.restore(self.names, rest)
+        given = {"_choice": {"config": self.config, "span_V": self._span_V}}
+        restore(made, rest, {"contestants": len(self.names)}, given)
+        made._newest = made.judge.newest
+        made._serving = made._served()
         return made
 
     def check_state(self, values: dict[str, Any]) -> None:
@@ -756,12 +609,3 @@ class Competition:
         if values["_choice"].champion >= len(self.names):
             champion = values["_choice"].champion
             raise ValueError(f"champion: got {champion}, expected a number from 0 to {len(self.names) - 1}")
-
-    def _restore(self, state: StateDict) -> None:
-        """Continue from ``state``, which holds the same contestants. Raises ModelFileError."""
-        self.judge.restore(self.names, state)
-        newest = snapshots_of(state, "newest", self.names, self._newest)
-        given = {"_choice": {"config": self.config, "span_V": self._span_V}}
-        restore(self, state, {"contestants": len(self.names), **self._motion.sizes}, given)
-        self._newest = newest
-        self._serving = self._served()

@@ -22,11 +22,6 @@ class CompetitionConfig:
     patience_s : time for which both must hold before the challenger replaces the champion, s of scored motion. The
         favourite returns without margin and floor.
     blend_s : duration of a change of champion in a caller's stream of points, s.
-    cutoff_hz : bandwidth of the smoother, Hz.
-    rest_share, rest_s : a stage that stays within this share of the range for this long, s, is at rest.
-    glitch_share : a reading this far from the smoother's prediction, as a share of the range, is not scored.
-    settle : samples after a start, a gap or a jump that are not scored.
-    revive_s : time after which a failed favourite restarts, s.
 
     Raises InputError on a value out of range.
     """
@@ -38,22 +33,15 @@ class CompetitionConfig:
     floor: float = 0.0005
     patience_s: float = 0.5
     blend_s: float = 0.05
-    cutoff_hz: float = 120.0
-    rest_share: float = 0.002
-    rest_s: float = 0.2
-    glitch_share: float = 0.012
-    settle: int = 100
-    revive_s: float = 5.0
 
     def __post_init__(self) -> None:
-        if self.block < 1 or self.settle < 0:
-            raise InputError(f"block, settle: got {self.block}, {self.settle}, expected at least 1 and 0 samples")
+        if self.block < 1:
+            raise InputError(f"block: got {self.block}, expected at least 1 sample")
         if not (self.margin >= 1.0 and 0.0 <= self.floor < 1.0):
             raise InputError(f"margin, floor: got {self.margin}, {self.floor}, expected at least 1, and 0 to 1")
-        for name in ("horizon_s", "cutoff_hz", "rest_share", "rest_s", "glitch_share"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"{name}: got {getattr(self, name)}, expected a positive number")
-        for name in ("serving_age_s", "patience_s", "blend_s", "revive_s"):
+        if not self.horizon_s > 0.0:
+            raise InputError(f"horizon_s: got {self.horizon_s}, expected a positive number")
+        for name in ("serving_age_s", "patience_s", "blend_s"):
             if not 0.0 <= getattr(self, name) <= 100.0:
                 raise InputError(f"{name}: got {getattr(self, name)}, expected 0 to 100 s")
 

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from service.answers.answering import Served as Served
     from service.answers.answering import answer as answer
     from service.answers.answering import derivatives as derivatives
-    from service.answers.answering import trust_by_age as trust_by_age
     from service.answers.fallback import Rules as Rules
     from service.answers.fallback import answer_safely as answer_safely
     from service.answers.guard import Limits as Limits
+    from service.answers.which_model import Answering as Answering
+    from service.answers.which_model import trust_by_age as trust_by_age
 
 __getattr__ = lazy_names(__name__)

@@ -20,6 +20,7 @@ from baselines.competition.champion import ChampionInverse
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain
 from service.answers.slices import Pace
+from service.answers.which_model import trust_by_age
 from service.config.settings import AxisConfig
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
@@ -172,16 +173,6 @@ class Served:
     def thaw(self) -> Served:
         """The same, not frozen."""
         return replace(self, frozen=False, held=None)
-
-
-def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[float, bool]:
-    """(weight, stale) of a model whose newest sample is ``age_s`` old, s, where samples are expected.
-
-    Stale from ``stale_s`` on (0: never); from ``last_good_s`` on the stand-in takes over within a second.
-    """
-    if stale_s == 0.0 or age_s <= stale_s:
-        return 1.0, False
-    return 1.0 - min(1.0, max(0.0, age_s - last_good_s)), True
 
 
 def answer(

@@ -3,52 +3,26 @@
 Everything here is a pure function of a snapshot and a query. The service answers by it, and so does a follower in
 its own process, so that both give the same voltages to the last bit.
 
-Inside the learnt domain the model answers alone. Outside, its weight falls smoothly with the distance from the domain:
-with s the distance as a share of the learnt span, over ``blend_share``, the weight is 1 - s²(3 - 2s), and 0 from s = 1
-on. The stand-in is a baseline whose form bounds what it says far from its data.
+The weights are those of `service.answers.which_model`. The stand-in is a baseline whose form bounds what it says far
+from its data.
 """
 
 from __future__ import annotations
 
-import logging
 import math
-import threading
-import time
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.compiled import all_finite
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
-from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
 from service.answers.slices import Pace, in_slices
+from service.answers.which_model import domain_weight, log_model_error
 from service.protocol.model import StandIn
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
-
-# --- Errors that a model raises, which no model may: the answer is replaced, the reason is logged.
-
-_LOGGER: Final = logging.getLogger("dehyst.model")
-#: An error is logged again after this time, s; so many different ones are told apart.
-_AGAIN_S: Final = 60.0
-_MOST: Final = 64
-_lock: Final = threading.Lock()
-_logged: dict[tuple[str, str], float] = {}
-
-
-def log_model_error(model: InverseModel, error: Exception) -> None:
-    """Log what ``model`` raised, with its traceback, at most once a minute for each kind of model and error."""
-    key = type(model).__name__, type(error).__name__
-    now = time.monotonic()
-    with _lock:
-        if now - _logged.get(key, -_AGAIN_S) < _AGAIN_S or len(_logged) >= _MOST:
-            return
-        _logged[key] = now
-    _LOGGER.error("%s raised %s: %s; its answer is replaced", *key, error, exc_info=error)
-
 
 # --- Answers with a stand-in.
 
@@ -144,38 +118,6 @@ def _resumed(
     u_V = got.u_V[1:] + (resumes_V - got.u_V[0]) * fade
     safe, flags = guard(u_V, (marks & OUTSIDE_DOMAIN) == 0, model.dt_s, limits, u_before_V)
     return got._replace(u_V=safe, std_V=got.std_V[1:], flags=flags | marks)
-
-
-def domain_weight(
-    model: InverseModel, forward: Feedforward, points: tuple[FloatArray, FloatArray, FloatArray], blend_share: float
-) -> FloatArray:
-    """(n,) weight of the model by distance from its domain: 1 inside, 0 from ``blend_share`` spans outside on."""
-    weight = forward.inside.astype(np.float64)
-    bounds = domain_of(model)
-    if forward.inside.all() or bounds is None:
-        # A baseline is bounded by its own form; that it is outside is told, and that is all there is to do about it.
-        return np.ones(weight.size)
-    distance = np.zeros(weight.size)
-    for low_high, x in zip(bounds, points, strict=True):
-        low, high = low_high
-        span = high - low
-        if math.isfinite(span) and span > 0.0:
-            np.maximum(distance, np.maximum(low - x, x - high) / span, out=distance)
-    s = np.clip(distance / blend_share, 0.0, 1.0)
-    return np.where(forward.inside, 1.0, 1.0 - s * s * (3.0 - 2.0 * s))
-
-
-def domain_of(model: InverseModel) -> list[tuple[float, float]] | None:
-    """Bounds of y (µm), v (µm/s) and a (µm/s²) inside which ``model`` says "inside"; None where it has no bounds."""
-    if isinstance(model, ChampionInverse):
-        model = model.served
-    if not isinstance(model, LssvmInverse):
-        return None
-    lows, highs = model.domain[::2].tolist(), model.domain[1::2].tolist()
-    return [
-        (low - DOMAIN_MARGIN * (high - low), high + DOMAIN_MARGIN * (high - low))
-        for low, high in zip(lows, highs, strict=True)
-    ]
 
 
 def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArray], memory: FloatArray) -> Feedforward:

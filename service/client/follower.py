@@ -23,9 +23,10 @@ from adaptive.errors import DehystError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
-from service.answers.answering import begin_from, derivatives, trust_by_age
+from service.answers.answering import begin_from, derivatives
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from service.answers.guard import Limits, check_domain, guard, limit_voltage
+from service.answers.which_model import Answering, answering, seen_in, trust_by_age
 from service.client.correcting import Correcting, Motion
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
@@ -505,6 +506,11 @@ class Follower:
             return ""
         own = answered.names[answered.champion] if isinstance(answered, ChampionInverse) else self.name
         return f"{own}+{self._stand_in}" if self.last_flags & BLENDED else own
+
+    @property
+    def answering(self) -> Answering:
+        """Which model gave the last voltage, as far as messages tell: one that predicts better is not named in them."""
+        return answering(seen_in(self.last_flags, self._answered, self._newest[0].safety.trouble))
 
     @property
     def stale(self) -> bool:

@@ -30,8 +30,8 @@ from baselines.bouc_wen.model import BoucWenInverse
 from baselines.common import Domain
 from baselines.linear import LinearInverse
 from baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
-from service.answers.fallback import domain_of
 from service.answers.guard import Limits
+from service.answers.which_model import domain_of
 
 #: Support vectors that the C takes at a time; their number is filled up with weights of 0.
 _LANES: Final = 32

@@ -37,8 +37,6 @@ _PLAIN: Final = (
      ("quality", "share_within_std")),
     ("dehyst_model_gain_ratio", "gauge", "gain of the stage relative to the identified one", ("quality", "gain")),
     ("dehyst_trust_ratio", "gauge", "weight of the learning model, 0 to 1", ("trust",)),
-    ("dehyst_fallback", "gauge", "1 while the identified model is served in place of the learnt one",
-     ("quality", "fallback")),
     ("dehyst_frozen", "gauge", "1 while an operator has stopped the learning", ("frozen",)),
     ("dehyst_stale", "gauge", "1 while no fresh samples are known", ("stale",)),
     ("dehyst_queries", "counter", "feedforward queries answered or refused", ("queries", "count")),
@@ -93,8 +91,12 @@ class _Collector:
         trouble = GaugeMetricFamily(
             "dehyst_trouble", "1 while there is this trouble, with the reason", labels=(*_LABELS, "trouble", "why")
         )
+        which = GaugeMetricFamily(
+            "dehyst_answering", "1 for the model that answers by default", labels=(*_LABELS, "answering")
+        )
         for status in self._statuses:
             labels = _labels(status)
+            which.add_metric((*labels, str(status.get("answering", "unknown"))), 1.0)
             if name := str(status.get("trouble") or ""):
                 trouble.add_metric((*labels, name, str(status.get("trouble_why", ""))), 1.0)
             gates = status.get("samples", {}).get("gates", {})
@@ -106,7 +108,7 @@ class _Collector:
             for name, quantile in (("p50_us", "0.5"), ("p99_us", "0.99")):
                 if (value := _number(status, ("queries", name))) is not None:
                     latency.add_metric((*labels, quantile), 1e-6 * value)
-        yield from (refused, state, healthy, trouble, latency)
+        yield from (refused, state, healthy, trouble, which, latency)
 
 
 def _labels(status: dict[str, Any]) -> tuple[str, ...]:

@@ -22,9 +22,17 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
 from adaptive.state import Entry, Refused, load, part_of, restore, save
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
+from baselines.competition.champion import ChampionInverse
 from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
 from service.answers.guard import Limits
 from service.answers.slices import Pace
+from service.answers.which_model import (
+    Answering,
+    Seen,
+    answering,
+    is_identified,
+    trust_by_age,
+)
 from service.background.retuner import Retuned
 from service.config.settings import LEARN, AxisConfig
 from service.intake.command_witness import CommandWitness
@@ -37,11 +45,8 @@ from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
     NOT_COMMANDED,
     NOT_LEARNING,
-    POISON,
     UNUSABLE,
     LearnerSupervisor,
-    ModelWatch,
-    ModelWatchConfig,
     Revive,
     blend_share_of,
     champion_of,
@@ -200,7 +205,9 @@ class AxisEntries:
 
 
 #: Beginnings of the entries of the supervisor.
-_OF_SUPERVISOR: Final = ("frozen_by", "dead", "adoptions", "watch.", "model.", "mark.", "learner.")
+_OF_SUPERVISOR: Final = (
+    "frozen_by", "dead", "dead_at", "adoptions", "watch.", "choice.", "model.", "mark.", "learner.",
+)  # fmt: skip
 
 
 class Axis:
@@ -248,8 +255,9 @@ class Axis:
         self.clock = SampleClock(self.dt_s)
         self.tracker = MemoryTracker(self.dt_s)
         self.witness = CommandWitness(limits.u_max_V - limits.u_min_V)
-        watch = ModelWatch(ModelWatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
-        self.supervisor = LearnerSupervisor(config.learn, learner, watch, self.dt_s, self.note, revive)
+        self.supervisor = LearnerSupervisor(
+            config.learn, learner, limits, config.last_good_s, self.dt_s, self.note, revive
+        )
         #: What moves between two snapshots, for followers.
         self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.
@@ -317,6 +325,23 @@ class Axis:
     def gates(self) -> dict[str, int]:
         """Samples by verdict since the start."""
         return dict(self._gates)
+
+    def answering(self) -> Answering:
+        """Which model answers a query that names none."""
+        served, learn, age_s = self.newest, self.config.learn, self._age_s or 0.0
+        model = served.models[served.default]
+        learnt = learns(served.default, self.config)
+        age_weight = 1.0 if served.frozen else trust_by_age(age_s, self.config.stale_s, self.config.last_good_s)[0]
+        return answering(
+            Seen(
+                served.trouble,
+                served.trust * age_weight if learnt else 1.0,
+                frozen=served.frozen,
+                rival=isinstance(model, ChampionInverse) and model.champion != 0,
+                learns=learnt,
+                identified=learnt and is_identified(served.models[learn], self._identified[learn]),
+            )
+        )
 
     def note(self, event: str, detail: str, **more: Any) -> None:
         """Note an event at the last sample. From any thread."""
@@ -537,7 +562,7 @@ class Axis:
         memories = supervisor.memories(models, self.tracker.advance(models, last.memories), last.frozen)
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
-            trust=last.trust if last.frozen else supervisor.watch.trust, trouble=supervisor.watch.trouble,
+            trust=last.trust if last.frozen else supervisor.choice.trust, trouble=supervisor.choice.trouble,
             blend_share=last.blend_share
             if last.frozen
             else blend_share_of(supervisor.learner, last.stand_in, self.config.blend_share),
@@ -611,7 +636,7 @@ class Axis:
                     model = served.models[name]
                     role = f"frozen.{'auto' if name == AUTO else 'learn'}."
                     state |= {f"{role}kind": stored_kind(model), **prefixed(role, model.state_dict())}
-        state |= self.supervisor.state_dict(served.trouble in POISON)
+        state |= self.supervisor.state_dict()
         return state
 
     def restore(self, state: StateDict) -> None:
@@ -643,7 +668,7 @@ class Axis:
         now = self.newest
         models = dict(now.models)
         if supervisor.learner is not None:
-            good = supervisor.watch.good
+            good = supervisor.choice.good
             models[self.config.learn] = supervisor.learner.snapshot() if good is None else good
             models |= champion_of(supervisor.learner)
         for role, name in (("learn", self.config.learn), ("auto", AUTO)):

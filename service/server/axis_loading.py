@@ -13,7 +13,7 @@ import numpy as np
 from adaptive.errors import ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel, OnlineModel, Sample
-from baselines.competition.competition import Competition
+from baselines.competition.competition import Competition, Smooths
 from service.answers import guard
 from service.answers.guard import Limits
 from service.config.settings import COMPETE, AxisConfig
@@ -63,15 +63,12 @@ def load_axis(
             raise FieldError("compete", repr(name), expected)
     others = {name: models[name] for name in config.compete if name in models and name != config.learn}
 
-    def make(model: InverseModel) -> OnlineModel:
-        return factory(model, config.learner, limits)
-
     def begin(model: InverseModel) -> OnlineModel:
         """What learns from ``model``, against the online forms of the others; alone where none has one."""
-        learner = make(model)
-        if not others or not isinstance(model, LssvmInverse):
+        learner = factory(model, config.learner, limits)
+        if not others or not isinstance(model, LssvmInverse) or not isinstance(learner, Smooths):
             return learner
-        made = Competition.from_models(config.learn, learner, model, others, config.competition, make)
+        made = Competition.from_models(config.learn, learner, model, others, config.competition)
         return made if len(made.names) > 1 else learner
 
     learner = None

@@ -22,9 +22,10 @@ from baselines.linear import LinearInverse, LinearOnline
 from baselines.prandtl_ishlinskii.model import MpiInverse
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from service.answers.answering import MemoryTracker
+from service.answers.which_model import ModelChoice
 from service.intake.sequence import SampleClock, SequenceTracker
 from service.server.axis import AxisEntries
-from service.server.learner_supervisor import ModelWatch, SupervisorEntries
+from service.server.learner_supervisor import SampleWatch, SupervisorEntries
 
 _TITLE: Final = """\
 # State of an axis
@@ -45,7 +46,8 @@ _TABLES: Final[tuple[tuple[str, str, Any], ...]] = (
     ("Times of samples", "clock.", SampleClock),
     ("Memories of the served models", "tracker.", MemoryTracker),
     ("The supervisor of the learner", "", SupervisorEntries),
-    ("The watch over the model", "watch.", ModelWatch),
+    ("The watch over the samples", "watch.", SampleWatch),
+    ("The choice of the model that is served", "choice.", ModelChoice),
     ("The learner", "learner.", Parts),
     ("The window of the learner", "learner.window.", KernelSolverState),
     ("A competition", "learner.", Competition),

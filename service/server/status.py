@@ -123,6 +123,7 @@ def axis_status(
         "trouble_why": axis.trouble_why(trouble),
         "trust": served.trust,
         "stand_in": served.stand_in,
+        "answering": axis.answering(),
         "frozen": axis.frozen,
         "checkpoints": checkpoints,
         "operations": operations,

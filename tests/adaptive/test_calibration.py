@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,11 +25,11 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from baselines import fit_linear, fit_mpi
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
-from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.signals.voltages import generalisation_input, multitone, training_input
 from sim.stage.config import ParameterChange
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
+from tests.online_models import PlainLearner, SmoothingLearner
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
@@ -170,15 +171,32 @@ def test_what_is_served_by_default_while_learning_a_stage_that_changes(seed: int
         assert_calibrated(error_V[part], std_V[part], LEARNING)
 
 
+class ByChampion(PlainLearner):
+    """A competition of which the champion is asked."""
+
+    inner: Competition
+
+    def snapshot(self) -> InverseModel:
+        return self.inner.champion_model()
+
+
+class Poor(SmoothingLearner):
+    """Serves a model whose voltages are half as large as they should be."""
+
+    def snapshot(self) -> InverseModel:
+        model = self.inner.snapshot()
+        return replace(model, beta=0.5 * model.beta)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_baseline_that_is_served_states_what_it_is_wrong_by(seed: int) -> None:
     """MPI as champion: not the residuals of its own fit but the errors of its answers, the gain step's too."""
     training_V = training_input(DT_S, 10.0)[1]
     mpi = fit_mpi(training_V, rich(seed, training_V), DT_S)[0]
     model = model_of(seed)
-    competition = Competition.from_models("mpi", MpiOnline(mpi), model, {})
+    competition = Competition.from_models("lssvm_adaptive", Poor(Learner.from_model(model)), model, {"mpi": mpi})
     u_V = excitation(seed, 12.0)
-    error_V, std_V = foretold(competition, u_V, rich(seed, u_V, GAIN_STEP))
+    error_V, std_V = foretold(ByChampion(competition), u_V, rich(seed, u_V, GAIN_STEP))
     assert competition.champion == "mpi"
     for part in (slice(2000, 6000), slice(8000, None)):
         assert_calibrated(error_V[part], std_V[part], SERVED_BASELINE)

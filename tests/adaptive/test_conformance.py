@@ -78,7 +78,7 @@ def template(request: pytest.FixtureRequest, recording: Recording, model: LssvmI
 
 
 def clone(online: Any) -> Any:
-    return type(online).from_state(online.state_dict())
+    return online.restored(online.state_dict())
 
 
 def feed(online: OnlineModel, recording: Recording, start: int = 0, stop: int = N) -> list[str]:

@@ -17,11 +17,11 @@ from lab.rehearsal import Event, RehearsalConfig, identify, run_event
 from lab.rehearsal.disturbance import draw
 from lab.rehearsal.loop import LoopRecord
 from lab.rehearsal.plant import IdentifiedPlant
+from service.answers.which_model import NOTHING_LEARNT, VOLTAGE_DIFFERS
 from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
-from service.server.learner_supervisor import NOTHING_LEARNT, VOLTAGE_DIFFERS
 from service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.motions import motion
 from tests.foreign.plants import StageFactory, issue_plant, random_plant

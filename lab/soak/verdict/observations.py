@@ -28,11 +28,11 @@ from adaptive.types import FloatArray
 from lab.soak.controller import AXIS, STAGE, STRAY, ControlTask
 from lab.soak.fault_plan import FAULT_KINDS
 from lab.soak.machine_load import MachineLoad
+from service.answers.which_model import SAMPLES_POISONED, SENSOR_FROZEN
 from service.operating.remote import statuses
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
-from service.server.learner_supervisor import SAMPLES_POISONED, SENSOR_FROZEN
 from service.stage_node.faults import sound_key
 from service.stage_node.node import status_key
 

@@ -21,7 +21,7 @@ from baselines.competition.config import CompetitionConfig
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from tests.online_models import PlainModel
+from tests.online_models import SmoothingLearner
 
 DT, GAIN, SPAN_V, RANGE_UM = 1e-3, 11.0, 7.0, 77.0
 SEEN = Domain(0.0, 80.0, 2000.0)
@@ -41,21 +41,18 @@ def line(gain: float = GAIN, offset_um: float = 0.0) -> LinearInverse:
     return LinearInverse(LinearParameters(gain, offset_um), DT, SEEN, 0.1)
 
 
-class Fixed(PlainModel):
-    """An online model that learns nothing; its gain is set from outside, and it may be told to fail."""
+class Fixed(SmoothingLearner):
+    """An online model that serves a line; its gain is set from outside, and it may be told to fail."""
 
     def __init__(self, gain: float) -> None:
-        super().__init__(line())
+        super().__init__(Learner(replace(lssvm(), span_V=SPAN_V)))
         self.gain = gain
         self.fails = False
 
     def handle(self, sample: Sample) -> str:
         if self.fails:
             raise RuntimeError("out of order")
-        if sample.seq <= self.seq:
-            return "duplicate"
-        self.seq = sample.seq
-        return "learnt" if math.isfinite(sample.y_um) else "glitch"
+        return super().handle(sample)
 
     def snapshot(self) -> InverseModel:
         return line(self.gain) if math.isfinite(self.gain) else Broken(line())
@@ -96,7 +93,7 @@ def contest(
     favourite: float, other: float, config: CompetitionConfig | None = None
 ) -> tuple[Competition, Fixed, Fixed]:
     one, two = Fixed(favourite), Fixed(other)
-    return Competition({"one": one, "two": two}, RANGE_UM, SPAN_V, config), one, two
+    return Competition({"one": one, "two": two}, SPAN_V, config), one, two
 
 
 def test_the_better_one_is_served_after_a_while_and_the_favourite_comes_back() -> None:
@@ -259,46 +256,18 @@ def test_a_champion_that_is_not_finite_is_replaced_at_once() -> None:
     assert np.isfinite(served.feedforward(y, zero, zero, served.rest_memory(40.0)).u_V).all()
 
 
-def test_one_that_raises_is_out_and_the_favourite_begins_anew() -> None:
-    made: list[InverseModel] = []
-
-    def revive(model: InverseModel) -> Fixed:
-        made.append(model)
-        again = Fixed(GAIN)
-        return again
-
-    one, two = Fixed(GAIN), Fixed(1.05 * GAIN)
-    model = Competition({"one": one, "two": two}, RANGE_UM, SPAN_V, CompetitionConfig(revive_s=1.0), revive)
+def test_one_that_raises_is_out_and_what_the_favourite_raises_is_raised() -> None:
+    """Whoever watches the learner handles its failure, alone or in a competition."""
+    model, one, two = contest(GAIN, 1.05 * GAIN)
     feed(model, 1000, 0)
-    one.fails = True
-    feed(model, 500, 1000)
-    assert model.champion == "two"
-    assert model.counters()["contestants_failed"] == 1
-    feed(model, 6000, 1500)
-    assert len(made) == 1
-    assert model.champion == "one"
     two.fails = True
-    feed(model, 100, 7500)
-    model.favourite.fails = True  # type: ignore[attr-defined]
-    with pytest.raises(RuntimeError):
-        feed(model, 1, 7600)
-
-
-def test_one_that_begins_anew_does_not_inherit_its_score() -> None:
-    one, two = Fixed(GAIN), Fixed(1.05 * GAIN)
-    config = CompetitionConfig(revive_s=1.0)
-    model = Competition({"one": one, "two": two}, RANGE_UM, SPAN_V, config, lambda _: Fixed(2.0 * GAIN))
-    feed(model, 1000, 0)
-    assert model.standing()["contestants"]["one"]["rms_V"] < 0.01
+    feed(model, 100, 1000)
+    assert [name for name, _ in model.take_events()] == ["contestant_failed"]
+    assert model.counters()["contestants_failed"] == 1
+    assert model.champion == "one"
     one.fails = True
-    k = 1000
-    while "learner_begun_anew" not in [name for name, _ in model.take_events()]:
-        feed(model, 20, k)
-        k += 20
-        assert k < 4000
-    # As bad as can be, until it has been scored itself; its blocks so far were foretold by what it was.
-    assert model.standing()["contestants"]["one"]["rms_V"] > 0.9 * SPAN_V
-    assert model.champion == "two"
+    with pytest.raises(RuntimeError):
+        feed(model, 1, 1100)
 
 
 def test_frozen_the_champion_stays_and_nobody_learns() -> None:
@@ -326,10 +295,27 @@ def test_glitches_and_gaps_are_not_scored() -> None:
     assert model.champion == "one"
 
 
+@pytest.mark.parametrize("share", [0.01, 0.004])
+def test_motion_is_the_learners_so_spikes_are_in_no_score_and_what_is_between_them_is(share: float) -> None:
+    """Spikes of a share of the range, ten a second: each is in no score, and they hide no model that has gone wrong."""
+    model, one, _ = contest(GAIN, 1.05 * GAIN)
+    feed(model, 2000, 0)
+    u, y = motion(4000, 2000)
+    y += share * RANGE_UM * (np.arange(4000) % 97 == 0)
+    said = []
+    for k in range(4000):
+        if k == 1000:
+            assert model.standing()["contestants"]["one"]["rms_V"] < 1e-6
+            one.gain = 1.2 * GAIN
+        said.append(model.handle(Sample(2000 + k, (2000 + k) * DT, float(u[k]), float(y[k]))))
+    assert said.count("glitch") > 30
+    assert model.champion == "two"
+
+
 def test_one_that_knows_its_own_memory_is_judged_by_it() -> None:
     """Over samples without a reading where the stage has been is a guess; the learner has a better one."""
     learner = Learner(replace(lssvm(), span_V=SPAN_V))
-    model = Competition({"learner": learner, "line": Fixed(GAIN)}, RANGE_UM, SPAN_V)
+    model = Competition({"learner": learner, "line": Fixed(GAIN)}, SPAN_V)
     u = motion(3000)[0]
     # The strokes become small while nothing is read: what they turned at last stays in the memory for long.
     u[1500:] = 3.5 + (u[1500:] - 3.5) * np.exp(-np.arange(1500) * DT / 0.15)
@@ -345,15 +331,29 @@ def test_one_that_knows_its_own_memory_is_judged_by_it() -> None:
 
 
 def test_state_of_other_contestants_is_refused() -> None:
-    model = Competition({"mpi": MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01))}, RANGE_UM, SPAN_V)
-    state = model.state_dict()
-    assert Competition.from_state(state).names == ("mpi",)
+    def made(*names: str) -> Competition:
+        mpi = {name: MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01)) for name in names}
+        return Competition({"learner": Learner(replace(lssvm(), span_V=SPAN_V)), **mpi}, SPAN_V)
+
+    one = made("mpi")
+    feed(one, 1010, 0)
+    state = one.state_dict()
+    two = made("mpi").restored(state)
+    for model in (one, two):
+        feed(model, 1000, 1010)
+    assert [f"{score.square_V2!r}" for score in one.judge.scores] == [f"{s.square_V2!r}" for s in two.judge.scores]
+    for bad in (
+        {**state, "names": "learner,other"},
+        {name: value for name, value in state.items() if name != "champion"},
+        {name: value for name, value in state.items() if not name.startswith("model.mpi.")},
+        {**state, "past_seq": np.empty(0, dtype=np.int64)},
+    ):
+        with pytest.raises(ModelFileError):
+            made("mpi").restored(bad)
     with pytest.raises(ModelFileError):
-        Competition.from_state({**state, "kinds": "unheard"})
-    with pytest.raises(ModelFileError):
-        Competition.from_state({key: value for key, value in state.items() if key != "champion"})
-    with pytest.raises(InputError):
-        contest(GAIN, GAIN)[0].state_dict()
+        made("mpi", "more").restored(state)
+    with pytest.raises(InputError, match="learner"):
+        Competition({"mpi": MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01))}, SPAN_V)
 
 
 def test_a_champion_model_is_stored_and_refuses_what_does_not_fit() -> None:

@@ -15,9 +15,9 @@ from hypothesis.extra.numpy import arrays
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
-from service.answers.answering import trust_by_age
-from service.answers.fallback import Rules, answer_safely, domain_weight
+from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, guard, limit_voltage
+from service.answers.which_model import domain_weight, trust_by_age
 from service.config.settings import AxisConfig
 from service.protocol.model import StandIn, decode_model, encode_model
 from service.protocol.query import (

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.answers import fallback
+from service.answers import which_model
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits
-from service.server.learner_supervisor import voltages_along
+from service.answers.which_model import voltages_along
 from tests.service.conftest import make_models
 
 
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(fallback, "_logged", {})
+    monkeypatch.setattr(which_model, "_logged", {})
 
     class Broken:
         dt_s = 1e-3
@@ -50,7 +50,7 @@ def test_another_error_is_logged_too_and_a_sound_model_logs_nothing(
     broken: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR, "dehyst.model"):
-        fallback.log_model_error(broken, ValueError("one"))
-        fallback.log_model_error(broken, TypeError("other"))
+        which_model.log_model_error(broken, ValueError("one"))
+        which_model.log_model_error(broken, TypeError("other"))
         voltages_along(make_models()["linear"], np.linspace(0.0, 1.0, 3))
     assert len(caplog.records) == 2

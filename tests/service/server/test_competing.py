@@ -134,12 +134,14 @@ def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
     degrade(axis, 0.6)
     give(axis, recorded, 3000, 5000)
     assert learner.champion == "mpi"
+    assert axis.answering() == "rival"
     assert [event["event"] for event in axis.take_events()].count("champion_changed") == 1
     bad, served, baseline = (ask(axis, name).u_V[-1] for name in ("lssvm_adaptive", "", "mpi"))
     assert abs(served - baseline) < 0.15 < 0.4 < abs(bad - served)
     learner.favourite.snapshot = inner
     give(axis, recorded, 5000, 9000)
     assert learner.champion == "lssvm_adaptive"
+    assert axis.answering() == "learnt"
     np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
 
 

@@ -18,6 +18,7 @@ from adaptive.online.gates import DUPLICATE, GAP, LEARNT, OUT_OF_ORDER, UNTRUSTE
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answers.guard import Limits
+from service.answers.which_model import NOTHING_LEARNT
 from service.config.settings import AxisConfig
 from service.intake.sequence import AHEAD
 from service.protocol.model import fingerprint
@@ -25,9 +26,9 @@ from service.protocol.query import STAND_IN, FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_supervisor import NOTHING_LEARNT, UNUSABLE, ModelWatch, ModelWatchConfig
+from service.server.learner_supervisor import UNUSABLE, SampleWatch
 from service.storage.model_file import Bundle, BundleMeta
-from tests.online_models import PlainLearner
+from tests.online_models import SmoothingLearner
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
@@ -81,8 +82,10 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     bench.run(9000)
     before = bench.u_V
     assert bench.events == []
+    assert bench.axis.answering() == "learnt"
     bench.run(1000, lie)
     assert bench.axis.newest.trouble == name
+    assert bench.axis.answering() == "last_good"
     assert bench.events == ["trouble"]
     assert bench.u_V == pytest.approx(before, abs=0.2)
     told = fingerprint(bench.axis.newest.models[NAME])
@@ -90,8 +93,12 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     assert fingerprint(bench.axis.newest.models[NAME]) == told
     assert bench.axis.newest.trust == 1.0
     # After that the last good model is too old to be believed, and the baseline takes over in a second.
-    bench.run(3000, lie)
+    bench.run(1500, lie)
+    assert 0.0 < bench.axis.newest.trust < 1.0
+    assert bench.axis.answering() == "blended"
+    bench.run(1500, lie)
     assert bench.axis.newest.trust == 0.0
+    assert bench.axis.answering() == "stand_in"
     answer = bench.ask()
     assert answer.u_V[0] == pytest.approx(39.0 / 11.0)
     assert answer.flags[0] & STAND_IN
@@ -102,6 +109,7 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     assert bench.events == ["learner_went_back", "recovered"]
     assert bench.axis.newest.trouble == ""
     assert bench.axis.newest.trust == 1.0
+    assert bench.axis.answering() == "learnt"
     learnt = bench.axis.gates["learnt"]
     bench.run(500)
     assert bench.axis.gates["learnt"] > learnt
@@ -110,22 +118,20 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
 
 @pytest.mark.parametrize(
     ("swing", "learns", "verdict", "at_s"),
-    [(0.5, False, UNTRUSTED, 0.52), (0.5, True, UNTRUSTED, None), (0.005, False, UNTRUSTED, None),
+    [(0.5, False, UNTRUSTED, 0.5), (0.5, True, UNTRUSTED, None), (0.005, False, UNTRUSTED, None),
      (0.5, False, GAP, None)],
 )  # fmt: skip
 def test_half_a_second_of_motion_without_an_accepted_sample_is_a_trouble(
     swing: float, learns: bool, verdict: str, at_s: float | None
 ) -> None:
     """And neither is rest, nor a motion of which a sample is learnt now and then, nor the time after missing ones."""
-    watch = ModelWatch(ModelWatchConfig(), DT_S, LIMITS)
-    model = make_models()[NAME]
+    watch = SampleWatch(DT_S, 10.0)
     found: list[float] = []
     for k in range(1000):
         u_V = 5.0 + 10.0 * swing * math.sin(2.0 * math.pi * 3.0 * k * DT_S)
         watch.take(u_V, 50.0 + u_V, LEARNT if learns and k % 400 == 0 else verdict)
         if (k + 1) % 20 == 0:
-            watch.judge(model, model)
-            found += [(k + 1) * DT_S] * (watch.trouble == NOTHING_LEARNT)
+            found += [(k + 1) * DT_S] * (watch.trouble("") == NOTHING_LEARNT)
     assert (found[0] if found else None) == pytest.approx(at_s)
 
 
@@ -189,10 +195,11 @@ def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
     assert bench.events == []
 
 
-class Sick(PlainLearner):
+class Sick(SmoothingLearner):
     """A learner whose snapshots are mad for a while, or which raises."""
 
     def __init__(self, inner: OnlineModel, ill: range, raises: bool, alive: list[int]) -> None:
+        assert isinstance(inner, Learner)
         super().__init__(inner)
         self.ill, self.raises = ill, raises
         alive.append(1)
@@ -225,14 +232,19 @@ def test_a_mad_model_is_never_served() -> None:
     assert abs(bench.u_V - before) < 0.3
 
 
-def test_a_learner_that_failed_is_begun_anew_from_the_last_good_model() -> None:
+@pytest.mark.parametrize("compete", [(), ("linear",)])
+def test_a_learner_that_failed_is_begun_anew_from_the_last_good_model(compete: tuple[str, ...]) -> None:
+    """Alone and as a contestant: one way, and one trouble."""
     made: list[int] = []
-    axis = make_axis(lambda m, s, lim: Sick(make_learner(m, s, lim), range(2000, 2001), True, made))
+    axis = make_axis(
+        lambda m, s, lim: Sick(make_learner(m, s, lim), range(2000, 2001), True, made), compete=compete
+    )  # fmt: skip
     bench, there = Bench(axis), len(made)
     bench.run(1990)
     before = bench.u_V
     bench.run(4000)
     assert not axis.learning
+    assert axis.newest.trouble == "learner_failed"
     assert bench.events == ["learner_failed"]
     bench.run(2000)
     assert axis.learning

@@ -64,13 +64,13 @@ def test_the_refusal_names_the_entry_what_it_is_and_what_is_expected() -> None:
         (f"{window}.order", np.zeros(60, np.int64), "expected each of 0 to 59 once"),
         (f"{window}.C", state[f"{window}.C"] + 1000, "expected at most the window.s 60 samples"),
         ("learner.champion", 4, "champion: got 4, expected a number from 0 to 3"),
-        ("learner.kinds", "linear", "kinds: got 'linear', expected 'learner,"),
+        ("learner.names", "linear", "names: got 'linear', expected 'lssvm_adaptive,linear"),
         ("gates.learnt", 10**400, "expected an integer from -3 x 2.61"),
         ("gates.learnt", [1], "expected an integer"),
         ("sequence.gaps", np.zeros((2, 3), np.int64), r"gaps: got int64 \(2, 3\), expected .* a shape of \(n, 2\)"),
         ("learner.extra", np.zeros(3), "expected no entry of this name"),
         ("memory.mpi", np.zeros(99), r"memory.mpi: got float64 \(99,\), expected a shape"),
-        ("learner.motion.smoother.x", np.full(4, np.nan), "expected finite numbers"),
+        ("learner.rows", np.full((2, 5), np.nan), "expected finite numbers"),
     ):
         with pytest.raises(ModelFileError, match=words):
             axis.restore(state | {name: value})

@@ -1,0 +1,205 @@
+"""Which model answers: every row of both tables, the models that are kept, and the page that is drawn from them."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.sensor_trust import SENSOR_FAULTS
+from adaptive.state import restore, save
+from adaptive.types import InverseModel
+from baselines.competition.champion import ChampionInverse
+from service.answers.guard import Limits
+from service.answers.which_model import (
+    MODELS,
+    ROWS,
+    RULES,
+    Answering,
+    ModelChoice,
+    Seen,
+    answering,
+    is_identified,
+    page,
+    rule_of,
+    seen_in,
+)
+from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
+from tests.service.conftest import DT_S, make_models
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
+IDENTIFIED = make_models()["lssvm_adaptive"]
+assert isinstance(IDENTIFIED, LssvmInverse)
+#: Samples between two snapshots.
+EVERY = 20
+
+#: What is seen where each row is the first that holds.
+SITUATIONS = {
+    Answering.HELD: Seen(finite=False, weight=0.0, rival=True),
+    Answering.STAND_IN: Seen("sensor_stuck", 0.0, rival=True),
+    Answering.BLENDED: Seen("sensor_stuck", 0.3, frozen=True),
+    Answering.RIVAL: Seen("sensor_stuck", rival=True, frozen=True),
+    Answering.FROZEN: Seen("sensor_stuck", frozen=True, identified=True),
+    Answering.IDENTIFIED: Seen("sensor_stuck", identified=True),
+    Answering.LAST_GOOD: Seen("sensor_stuck"),
+    Answering.LEARNT: Seen(),
+}
+
+
+def test_the_page_is_up_to_date() -> None:
+    committed = (DOCS / "which_model.md").read_text(encoding="utf-8")
+    assert committed == page(), "run: python -m service.answers.which_model > docs/which_model.md"
+
+
+@pytest.mark.parametrize(("before", "after"), list(itertools.product(SITUATIONS, repeat=2)))
+def test_a_state_is_left_for_another_as_soon_as_that_is_what_is_seen(before: Answering, after: Answering) -> None:
+    """From each state to each: the word depends on nothing but what is seen."""
+    assert set(SITUATIONS) == set(Answering) == set(MODELS) == {row.answers for row in ROWS}
+    assert [answering(SITUATIONS[one]) for one in (before, after)] == [before, after]
+
+
+@pytest.mark.parametrize(
+    ("seen", "answers"),
+    [
+        (Seen(learns=False), Answering.IDENTIFIED),
+        (Seen(weight=0.999), Answering.BLENDED),
+        (Seen("nothing_learnt"), Answering.LEARNT),
+        (Seen("samples_lost"), Answering.LEARNT),
+    ],
+)
+def test_the_rest_of_the_rows(seen: Seen, answers: Answering) -> None:
+    assert answering(seen) is answers
+
+
+def test_flags_of_a_point_and_who_gave_it_say_the_same() -> None:
+    line = make_models()["linear"]
+    first, second = (ChampionInverse(("learner", "line"), (line, line), champion) for champion in (0, 1))
+    assert answering(seen_in(0, first)) is Answering.LEARNT
+    assert answering(seen_in(STALE, first, "sensor_sign")) is Answering.LAST_GOOD
+    assert answering(seen_in(0, second)) is Answering.RIVAL
+    assert answering(seen_in(BLENDED, second)) is Answering.BLENDED
+    assert answering(seen_in(STAND_IN | NOT_FINITE_REPLACED, None)) is Answering.STAND_IN
+    assert answering(seen_in(NOT_FINITE_REPLACED, None)) is Answering.HELD
+
+
+def test_every_trouble_of_the_learner_has_a_rule_and_every_rule_is_on_both_pages() -> None:
+    assert RULES.keys() >= SENSOR_FAULTS
+    assert not any(rule_of(name).teaches for name in SENSOR_FAULTS)
+    explained = (DOCS / "learner.md").read_text(encoding="utf-8").partition("### Troubles")[2]
+    named = (DOCS / "protocol.md").read_text(encoding="utf-8")
+    for trouble in RULES.keys() - {""}:
+        assert re.search(rf"^\| `{trouble}`|^\| .*, `{trouble}`", explained, re.MULTILINE), trouble
+        assert f"`{trouble}`" in named, trouble
+
+
+def model(number: int) -> LssvmInverse:
+    """The model of snapshot ``number``: it differs by as many thousandths of a volt."""
+    beta = IDENTIFIED.beta.copy()
+    beta[0] += 1e-3 * number
+    return replace(IDENTIFIED, beta=beta)
+
+
+class Life:
+    """Snapshots one after the other; each brings another model."""
+
+    def __init__(self) -> None:
+        self.choice = ModelChoice(DT_S, LIMITS, last_good_s=2.0)
+        self.number = 0
+        self.newest: InverseModel | None = None
+
+    def go(self, count: int, found: str = "", distrusts: bool = False, failed: bool = False) -> int:
+        """``count`` snapshots; the number of the one that is served then."""
+        for _ in range(count):
+            self.number += 1
+            self.newest = None if failed else model(self.number)
+            good = self.choice.choose(self.number * EVERY, self.newest, IDENTIFIED, found, distrusts)
+        assert isinstance(good, LssvmInverse)
+        return round(1e3 * float(good.beta[0] - IDENTIFIED.beta[0]))
+
+
+#: By trouble: how many snapshots of 0.02 s the served model is old when the trouble is named after 100 of them.
+AGES = {
+    **dict.fromkeys(("sensor_frozen", "samples_poisoned", *SENSOR_FAULTS), (25, 50)),
+    "voltage_differs": (5, 50),
+    "model_bad": (1, 1),
+    "learner_failed": (1, 1),
+    **dict.fromkeys(("", "nothing_learnt"), (0, 0)),
+}
+
+
+@pytest.mark.parametrize("trouble", RULES)
+def test_each_trouble_serves_the_model_of_its_rule(trouble: str) -> None:
+    life = Life()
+    assert life.go(110) == 110
+    served = life.go(1, trouble, failed=trouble == "learner_failed")
+    least, most = AGES[trouble]
+    assert least <= life.number - served <= most
+    newest = life.go(10, trouble, failed=trouble == "learner_failed")
+    # The newest is served on, or what was kept stays.
+    assert newest == (life.number if most == 0 else served)
+    assert life.choice.trouble == trouble
+    # It is over half a second after the last sign of it, and the newest is served again.
+    life.go(24)
+    assert life.choice.trouble == trouble
+    assert life.go(1) == life.number
+    assert life.choice.trouble == ""
+    assert life.choice.rule == rule_of("")
+
+
+@pytest.mark.parametrize("trouble", sorted(RULES.keys() - {""}))
+def test_a_trouble_that_lasts_takes_the_trust_and_its_end_gives_it_back(trouble: str) -> None:
+    life = Life()
+    life.go(100)
+    failed = trouble == "learner_failed"
+    life.go(101, trouble, failed=failed)
+    assert life.choice.trust == 1.0
+    life.go(25, trouble, failed=failed)
+    assert life.choice.trust == pytest.approx(0.5)
+    life.go(30, trouble, failed=failed)
+    assert life.choice.trust == 0.0
+    life.go(80)
+    assert life.choice.trust == 1.0
+
+
+def test_on_trial_the_learners_own_model_is_served_which_is_from_before() -> None:
+    life = Life()
+    life.go(100)
+    kept = life.go(5, "sensor_stuck")
+    assert kept < 100
+    assert life.go(5, "sensor_stuck", distrusts=True) == life.number
+
+
+@pytest.mark.parametrize("trouble", ["", "nothing_learnt"])
+def test_a_model_that_is_not_fit_is_served_during_no_trouble(trouble: str) -> None:
+    """Also where the trouble lets the newest one answer."""
+    life = Life()
+    life.go(100)
+    bad = replace(IDENTIFIED, beta=40.0 * IDENTIFIED.beta)
+    good = life.choice.choose(101 * EVERY, bad, IDENTIFIED, trouble)
+    assert good is not bad
+    assert life.choice.trouble == "model_bad"
+
+
+def test_a_state_goes_on_alike() -> None:
+    life = Life()
+    life.go(110)
+    life.go(20, "sensor_stuck")
+    other = Life()
+    other.number = life.number
+    restore(other.choice, save(life.choice))
+    other.choice.keep(life.choice.models())
+    assert [life.go(30), life.choice.trust] == [other.go(30), other.choice.trust]
+
+
+def test_what_the_learner_serves_is_known_as_the_identified_model() -> None:
+    assert is_identified(replace(IDENTIFIED, noise_variance=0.5, seq=7), IDENTIFIED)
+    assert not is_identified(model(1), IDENTIFIED)
+    assert not is_identified(replace(IDENTIFIED, alpha=IDENTIFIED.alpha + 1.0), IDENTIFIED)
+    line = make_models()["linear"]
+    assert is_identified(line, line)
+    assert not is_identified(line, IDENTIFIED)
