@@ -31,8 +31,6 @@ _STARTS, _NUMBERS_PER_START = 1000, 1_000_000_000
 SERVICES: Final = ("a", "b")
 #: Folders of a service; a standby's have a suffix.
 FOLDERS: Final = ("recording", "checkpoints")
-#: Period of the bare paced loop, s.
-_LOOP_STEP_S: Final = 2e-3
 #: Between the last sample and the end of the services, so that they handle what is under way, s.
 _DRAIN_S: Final = 1.0
 
@@ -62,8 +60,7 @@ def identify(config: StageConfig, path: Path, seed: int) -> ControlTask:
 
 
 class SoakRig:
-    """The processes by name: router, a and b (the services), stage, controller, prober, echo, viewer, and a bare paced
-    loop that measures the delays of the machine.
+    """The processes by name: router, a and b (the services), stage, controller, prober, viewer.
 
     Parameters
     ----------
@@ -114,11 +111,9 @@ class SoakRig:
         # Start all, then wait for each: most of the time goes into imports.
         for name in SERVICES:
             self.start_service(name, standby=name != SERVICES[0])
-        self.rig.start_echo(wait=False)
-        self.rig.start_paced_loop(_LOOP_STEP_S, wait=False)
         self.start_viewer()
         self.start_stage()
-        self.rig.wait_ready(*SERVICES, "echo", "bare", "viewer")
+        self.rig.wait_ready(*SERVICES, "viewer")
         for name in ("controller", "prober"):
             program = ["-m", f"lab.soak.{name}", str(self._task_file), self.rig.endpoint]
             self.rig.start(name, program, wait=False)
@@ -184,7 +179,7 @@ class SoakRig:
 
     def stop(self) -> None:
         """Stop clients first, then the stage, then, when the last samples are handled, the services and the router."""
-        services = ("viewer", "echo", "bare", *reversed(SERVICES))
+        services = ("viewer", *reversed(SERVICES))
         for names in (("prober", "controller"), ("stage",), services, ("router",)):
             for name in names:
                 self.children[name].send(signal.SIGINT)
