@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,22 +60,20 @@ def run_live(
 
 
 class _Watch:
-    """The loop of a run, and a thread that reads processes, statuses and measuring clients once a second."""
+    """The loop of a run. Once a second it reads processes, statuses and measuring clients."""
 
     def __init__(self, soak: SoakRig, monitor: Monitor, observed: Observations, say: Say) -> None:
         self._soak, self._monitor, self._observed, self._say = soak, monitor, observed, say
         self._actions = FaultActions(soak, monitor)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._observe, name="soak-observe")
+        self._missing: set[int] = set()
 
     def run(self, plan: SoakPlan, stopped: Callable[[], bool]) -> float:
         """Run the plan until its end or until ``stopped``; returns how long that was, s."""
         monitor, actions = self._monitor, self._actions
         monitor.begin()
-        self._thread.start()
         schedule = Schedule(plan, actions.possible)
         under_way: tuple[PlannedFault, float, FaultRecord] | None = None
-        told_s = 0.0
+        seen_s = told_s = 0.0
         while monitor.now() < plan.duration_s and not stopped():
             if under_way is None:
                 fault = schedule.due(monitor.now())
@@ -89,6 +86,9 @@ class _Watch:
                 schedule.over(under_way[0], self._end(under_way[2]))
                 under_way = None
             actions.tick()
+            if monitor.now() - seen_s >= 1.0:
+                seen_s = monitor.now()
+                self._observe()
             if monitor.now() - told_s >= _PROGRESS_S:
                 told_s = monitor.now()
                 self._progress(plan)
@@ -110,32 +110,27 @@ class _Watch:
         return record.end_s
 
     def close(self) -> None:
-        """Undo the fault that is under way, and end the thread."""
+        """Undo the fault that is under way."""
         self._actions.finish()
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join()
         self._observed.notes.extend(self._actions.notes)
 
     def _observe(self) -> None:
-        missing: set[int] = set()
         observed, monitor = self._observed, self._monitor
-        while not self._closing.wait(1.0):
-            for status in monitor.ask():
-                name = self._soak.service_of(str(status["instance"]))
-                if name and status.get("role", "primary") == "primary":
-                    self._actions.primary = name
-            for instance, (t_s, status) in list(monitor.statuses.items()):
-                if monitor.now() - t_s < _FRESH_S:
-                    observed.counters.append(Counted.of(t_s, instance, status))
-            for line in self._lines("prober", "t_s"):
-                observed.probes.append(QuerySecond.of(line, line["t_s"] - monitor.start_s))
-            for line in self._lines("controller", "blocks"):
-                observed.unsafe_blocks = max(observed.unsafe_blocks, int(line["unsafe"]))
-            for name, child in [(name, self._soak.children[name]) for name in LASTING]:
-                if not child.running and child.pid not in self._actions.killed | missing:
-                    missing.add(child.pid)
-                    observed.ended.append((monitor.now(), name))
+        for status in monitor.ask():
+            name = self._soak.service_of(str(status["instance"]))
+            if name and status.get("role", "primary") == "primary":
+                self._actions.primary = name
+        for instance, (t_s, status) in list(monitor.statuses.items()):
+            if monitor.now() - t_s < _FRESH_S:
+                observed.counters.append(Counted.of(t_s, instance, status))
+        for line in self._lines("prober", "t_s"):
+            observed.probes.append(QuerySecond.of(line, line["t_s"] - monitor.start_s))
+        for line in self._lines("controller", "blocks"):
+            observed.unsafe_blocks = max(observed.unsafe_blocks, int(line["unsafe"]))
+        for name, child in [(name, self._soak.children[name]) for name in LASTING]:
+            if not child.running and child.pid not in self._actions.killed | self._missing:
+                self._missing.add(child.pid)
+                observed.ended.append((monitor.now(), name))
 
     def _lines(self, name: str, first_key: str) -> Iterator[dict[str, Any]]:
         """The JSON lines, beginning with ``first_key``, that a process has printed since the last call."""

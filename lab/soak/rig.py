@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import signal
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -75,7 +74,6 @@ class SoakRig:
         self.model = model
         self._out, self._stage = out, stage
         self._stage_starts = 0
-        self._strangers = 0
         self._task_file = self.rig.logs / "control.json"
         task.write(self._task_file)
         write_offset(self.wall_clock, 0.0)
@@ -144,20 +142,13 @@ class SoakRig:
         options = ["--file", str(path), "--endpoint", self.rig.endpoint, "--inject", "--first", str(first)]
         self.rig.start_stage(STAGE, AXIS, *options, "--slew", repr(self.task.slew_V_per_s), wait=False)
 
-    def start_disturber(self, what: str, index: int, *arguments: str) -> Callable[[], None]:
-        """Start a process of `lab.soak.disturbers` and wait until it is ready; returns what ends it."""
-        program = ["-m", "lab.soak.disturbers", what, self.rig.endpoint, *arguments]
-        child = self.rig.start(f"{what}{index}", program)
-        return lambda: child.send(signal.SIGTERM)
-
-    def start_stranger(self, what: str, seed: int, *arguments: str) -> Child:
-        """Start a process of `lab.soak.strangers` and wait until it is ready."""
-        self._strangers += 1
-        program = ["-m", "lab.soak.strangers", what, self.rig.endpoint, str(seed), *arguments]
-        return self.rig.start(f"stranger{self._strangers}", program)
+    def start_helper(self, module: str, name: str, what: str, *arguments: str) -> Child:
+        """Start a process of this package's ``module`` and wait until it is ready."""
+        return self.rig.start(name, ["-m", f"lab.soak.{module}", what, self.rig.endpoint, *arguments])
 
     def take_folders_away(self, name: str, now_s: float) -> list[Path]:
-        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where they were.
+        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where the first
+        were.
 
         What was recorded must still be counted at the end; checkpoints of hours would fill the disk.
         """
@@ -168,7 +159,7 @@ class SoakRig:
             path.rename(away / path.name)
         for path in checkpoints:
             shutil.rmtree(path, ignore_errors=True)
-        return [*recordings, *checkpoints]
+        return recordings
 
     def service_of(self, instance: str) -> str:
         """Name of the service with this instance id, which contains its process id; "" if there is none."""

@@ -223,14 +223,14 @@ class Watched:
     def now(self) -> float:
         return 1.0
 
-    def start_stranger(self, *_: object) -> Stepping:
+    def start_helper(self, *_: object) -> Stepping:
         return Stepping(self._told)
 
     def service_of(self, _: str) -> str:
         return "a"
 
     def take_folders_away(self, *_: object) -> list[Path]:
-        return [self._folder / "recording", self._folder / "checkpoints"]
+        return [self._folder / "recording"]
 
 
 @pytest.mark.parametrize(
