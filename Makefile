@@ -8,12 +8,11 @@ SEED   ?= 0
 # is marked "alone", and runs so at the end.
 PROCESSES := $(addprefix tests/e2e/,test_soak.py test_scale.py test_demo.py) \
           tests/service/failover tests/service/protocol/test_fuzz.py \
-          $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py test_restart_bench.py) \
+          $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py) \
           $(addprefix tests/service/,viewer/test_sink.py viewer/test_live.py operating security \
           server/test_process.py server/test_gap_live.py storage/test_recorder.py storage/test_folders.py \
           stage_node fleet adapters client protocol/test_protocol_page.py background/test_priority.py \
-          runtime/test_memory.py runtime/test_stopping.py) \
-          $(addprefix tests/lab/soak/,test_prober.py test_stalls.py)
+          runtime/test_memory.py runtime/test_stopping.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
 
@@ -85,7 +84,7 @@ docs: .setup-test ## the site of the documentation, offline, into out/site; a wa
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "out/site/index.html: to search in it, call $(BIN)/python -m http.server --directory out/site"
 
-bench: setup-test ## the solver beside its yardsticks and its peers
+bench: setup-test ## the solver beside its yardsticks
 	$(BIN)/dehyst bench
 
 foreign: setup ## 500 random stages and events in lockstep, with the table of goals (half an hour; SEED=0)

@@ -8,8 +8,6 @@ from threadpoolctl import threadpool_limits
 
 from adaptive.warm import warm
 from benchmarks.drift import bench_drift
-from benchmarks.kalman_reference import bench_kalman
-from benchmarks.peers import bench_peers
 from benchmarks.solver import bench_window
 
 SIZES = (100, 250, 500, 1000, 2000)
@@ -20,7 +18,7 @@ def run(quick: bool = False) -> dict[str, Any]:
 
     Returns
     -------
-    ``{"window": {N: {...}}, "peers": {...}, "drift": [...], "kalman": {...}}``; times in µs, errors without unit.
+    ``{"window": {N: {...}}, "drift": [...]}``; times in µs, errors without unit.
     """
     warm()
     with threadpool_limits(1):
@@ -28,11 +26,9 @@ def run(quick: bool = False) -> dict[str, Any]:
         for n in SIZES:
             repeats = 2000 if n <= 500 else 400 if n <= 1000 else 100
             window[str(n)] = bench_window(n, repeats // 4 if quick else repeats)
-        peers = bench_peers(500, 20 if quick else 100)
         updates = 20_000 if quick else 1_000_000
         drift = bench_drift(updates) + bench_drift(updates, 500, forms=("auto",))
-        kalman = bench_kalman(2_000 if quick else 20_000)
-    return {"window": window, "peers": peers, "drift": drift, "kalman": kalman}
+    return {"window": window, "drift": drift}
 
 
 def page(report: dict[str, Any]) -> str:
@@ -55,12 +51,6 @@ def page(report: dict[str, Any]) -> str:
         row = report["window"]["500"]
         spread = ((name, row[f"{name}_p99_over_median"]) for name in ("update", "dsymv", "memory_pass"))
         lines += ["", "p99 over the median at N = 500: " + ", ".join(f"{name} {value:.2f}" for name, value in spread)]
-    lines += ["", "The same stream, N = 500: learning one sample, and the error of predicting it before", ""]
-    for name, row in report["peers"].items():
-        if "missing" in row:
-            lines.append(f"{name:>14} not installed: {row['missing']}")
-            continue
-        lines.append(f"{name:>14} {row['update_us']:>12.1f} µs {row['over_dehyst']:>8.1f} x   RMSE {row['rmse']:.5f}")
     lines += ["", "Relative error of alpha after many updates, near-duplicates in the stream", ""]
     for row in report["drift"]:
         lines.append(
@@ -68,13 +58,4 @@ def page(report: dict[str, Any]) -> str:
             f"{row['updates']:.0f} updates  "
             f"worst {row['worst_alpha_error']:.1e}  refinements {row['refinements']:.0f}"
         )
-    row = report["kalman"]
-    lines += [
-        "",
-        "The learner's Kalman filter, compiled, against filterpy as the reference",
-        "",
-        f"  {row['coefficients']:.0f} coefficients, {row['updates']:.0f} updates: "
-        f"estimate within {row['estimate_error']:.1e}, covariance within {row['covariance_error']:.1e}, "
-        f"{row['compiled_us']:.1f} µs an update in place of {row['reference_us']:.1f} µs",
-    ]
     return "\n".join(lines)

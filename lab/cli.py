@@ -21,7 +21,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "rehearse": _experiment("rehearse", "try the service on your own simulated stage, with disturbances"),
     "scenarios": _experiment("scenarios", "compare adapting with not adapting in every kind of drift"),
     "soak": _experiment("soak", "run all processes under a seeded schedule of faults, and check what must hold"),
-    "bench": _experiment("bench", "measure the solver's speed and accuracy beside its peers, from a checkout"),
+    "bench": _experiment("bench", "measure the solver's speed and accuracy, from a checkout"),
     "reproduce": _experiment("reproduce", "compute the chapter's tables and figures, beside its own numbers"),
 }
 

@@ -20,11 +20,9 @@ import numpy as np
 from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
+from lab.loop import Asker, Twins, samples, turns
 from service.answers.guard import Limits
-from service.client.client import PendingCommands
 from service.config.settings import AxisConfig
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
 from service.reports import tables
 from service.reports.plot_style import MOST_POINTS, figure, legend, line, save
 from service.server.axis_loading import load_axis
@@ -101,52 +99,32 @@ def run_scenario(
     )
     bundle = Bundle({ADAPTIVE: model, FROZEN: replace(model, name=FROZEN)}, BundleMeta("scenario", "x", dt))
     axis = load_axis("scenario", config, bundle=bundle)
-    stage = Stage(scenario.changing_stage())
-    states = {name: stage.initial_state() for name in MODELS}
     wanted = scenario.reference()
     n = wanted.y_um.size // BLOCK * BLOCK
-    u_V = {name: np.zeros(n) for name in MODELS}
-    y_um = {name: np.zeros(n) for name in MODELS}
-    commanded = PendingCommands()
-    memory: FloatArray | None = None
-    last_V = dict.fromkeys(MODELS, float("nan"))
+    twins = Twins(Stage(scenario.changing_stage()), MODELS, n)
+    # The axis tracks the adaptive twin's stage; the other twin sends its memory along.
+    ask = {name: Asker(axis, name, tracked=name == ADAPTIVE) for name in MODELS}
     names: dict[str, int] = {}
     gate = np.zeros(n, dtype=np.int16)
-    ahead = LEAD // BLOCK
-    for block in range(n // BLOCK + ahead + 1):
-        done = (block - ahead - 1) * BLOCK
-        if done >= 0:
-            part = slice(done, done + BLOCK)
+    for run, asked in turns(n // BLOCK, LEAD // BLOCK):
+        if run is not None:
+            part = slice(run * BLOCK, (run + 1) * BLOCK)
+            twins.run(part)
+            read = scenario.glitches.applied(part.start, twins.y_um[ADAPTIVE][part])
+            verdicts = axis.handle(samples(part.start, dt, twins.u_V[ADAPTIVE][part], read))
+            gate[part] = [names.setdefault(verdict, len(names)) for verdict in verdicts]
+            if part.stop % 1000 == 0:
+                progress(part.stop * dt)
+        if asked is not None:
+            part = slice(asked * BLOCK, (asked + 1) * BLOCK)
+            motion = wanted.y_um[part], wanted.v_um_per_s[part], wanted.a_um_per_s2[part]
             for name in MODELS:
-                y_um[name][part] = stage.run(states[name], u_V[name][part])[0]
-            seq = np.arange(part.start, part.stop)
-            t_s: FloatArray = (seq * dt).astype(np.float64)
-            read = scenario.glitches.applied(done, y_um[ADAPTIVE][part])
-            for k, verdict in zip(seq, axis.handle(SampleBatch(seq, t_s, u_V[ADAPTIVE][part], read)), strict=True):
-                gate[k] = names.setdefault(verdict, len(names))
-            if (done + BLOCK) % 1000 == 0:
-                progress((done + BLOCK) * dt)
-        if block * BLOCK >= n:
-            continue
-        part = slice(block * BLOCK, (block + 1) * BLOCK)
-        as_of = max(-1, part.start - LEAD - MARGIN)
-        for name in MODELS:
-            points = (wanted.y_um[part], wanted.v_um_per_s[part], wanted.a_um_per_s2[part])
-            # The axis tracks the adaptive twin's stage; the other twin sends its memory along.
-            mine = name == ADAPTIVE
-            pending = commanded.before(part.start) if mine else None
-            query = FeedforwardQuery(*points, None if mine else memory, name, as_of, last_V[name], pending)
-            reply = axis.answer(query)
-            u_V[name][part], last_V[name] = reply.u_V, float(reply.u_V[-1])
-            if mine:
-                commanded.take(part.start, wanted.y_um[part], reply)
-            else:
-                memory = reply.memory
+                twins.u_V[name][part] = ask[name](part.start, motion, max(-1, part.start - LEAD - MARGIN)).u_V
     learner = axis.learner
     return ScenarioRecord(
         scenario=scenario,
         wanted_um=wanted.y_um[:n],
-        error_um={name: wanted.y_um[:n] - y_um[name] for name in MODELS},
+        error_um={name: wanted.y_um[:n] - twins.y_um[name] for name in MODELS},
         floor_um=_floor(scenario, n),
         verdicts=axis.gates,
         counters=learner.counters() if learner is not None else {},

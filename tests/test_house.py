@@ -6,12 +6,16 @@ import importlib
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
-from typing import Any
 
+import grimp
+import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
-from benchmarks import house
+from benchmarks import size
 
 ROOT = Path(__file__).resolve().parents[1]
 TRACKED = [
@@ -20,59 +24,39 @@ TRACKED = [
 ]
 
 
-#: Abilities that are still found by name. A library's object or any exception may lack the attribute; nothing of ours.
-ATTRIBUTES_BY_NAME_AT_MOST = 1
-#: Attributes of libraries that the product sets: the output while a command redirects it, a C function's result type,
-#: the clock of a process that runs with a shifted one, and whether pipython asks a controller for its errors. An object
-#: of ours changes itself, by its own methods.
-SET_ON_LIBRARIES = {"sys.stdout", "library.mallinfo2.restype", "time.time", "time.time_ns", "self._device.errcheck"}
-
-
-@pytest.fixture(scope="module")
-def measures() -> dict[str, Any]:
-    return house.static_measures(ROOT)
-
-
-def test_no_folder_has_more_than_15_modules_but_the_library_of_effects(measures: dict[str, Any]) -> None:
+def test_no_folder_has_more_than_15_modules_but_the_library_of_effects() -> None:
     """One effect is one file, so the files of that folder are alike."""
-    assert [folder.split()[0] for folder in measures["large folders"]] == ["sim/effects"]
+    folders = Counter(
+        path.parent for top in size.PACKAGES for path in (ROOT / top).rglob("*.py") if path.stem[0] != "_"
+    )
+    assert [str(folder.relative_to(ROOT)) for folder, files in folders.items() if files > 15] == ["sim/effects"]
 
 
-def test_no_modules_import_each_other(measures: dict[str, Any]) -> None:
-    """Imports for type checking only count as well."""
-    assert not measures["import circles"]
+def test_no_modules_import_each_other() -> None:
+    """Imports in functions and for type checking only count as well."""
+    graph = grimp.build_graph(*size.PACKAGES, cache_dir=None)
+    modules = {name: i for i, name in enumerate(sorted(graph.modules))}
+    pairs = [
+        (modules[name], modules[other]) for name in modules for other in graph.find_modules_directly_imported_by(name)
+    ]
+    rows, columns = zip(*pairs, strict=True)
+    imports = csr_array((np.ones(len(pairs)), (rows, columns)), shape=(len(modules), len(modules)))
+    groups = connected_components(imports, connection="strong")[1]
+    circles = [[name for name, i in modules.items() if groups[i] == group] for group in np.unique(groups)]
+    assert [circle for circle in circles if len(circle) > 1] == []
 
 
-def test_an_ability_is_a_protocol_not_a_string(measures: dict[str, Any]) -> None:
-    found = measures["getattr/hasattr by name"]
-    assert len(found) <= ATTRIBUTES_BY_NAME_AT_MOST, "\n".join(found)
-
-
-def test_no_attribute_is_set_on_an_object_of_another_module(measures: dict[str, Any]) -> None:
-    # `adaptive.state` fills any object of ours by its declaration: that is what it is for.
-    lines = [line for line in measures["set from outside"] if not line.startswith("adaptive/state.py")]
-    found = [line for line in lines if line.split(": ")[1] not in SET_ON_LIBRARIES]
-    assert not found, "\n".join(found)
-
-
-def test_nothing_frozen_is_changed(measures: dict[str, Any]) -> None:
-    assert not measures["frozen changed"]
-
-
-def test_this_checkout_has_sane_numbers_and_all_that_is_traced(measures: dict[str, Any]) -> None:
-    known = house.modules_of(ROOT)
-    files, code = measures["files"], measures["code lines"]
-    assert files["total"] > 100
-    assert files["total"] == sum(n for name, n in files.items() if name != "total") == len(known)
-    assert 10_000 < code["total"] < measures["all lines"]["total"]
-    assert set(files) <= {*house.PACKAGES, "total"}
-    assert set(house.places(known)) == set(house.NAMES), "the traced measures need these names"
+def test_lines_of_code_are_counted() -> None:
+    lines = ['"""What it is."""', "", "x = 1  # one", "", "# none", "def f():", '    """It does."""', '    y = """']
+    text = "\n".join([*lines, "", '"""', "    return (", "        y", "    )", ""])
+    assert size.code_lines(text) == 7
+    assert 20_000 < sum(sum(size.sizes(ROOT, name).values()) for name in size.PACKAGES) < 60_000
 
 
 def test_every_name_that_a_package_offers_can_be_imported() -> None:
     """A wrong module behind a name that is loaded on first use would fail only there."""
     missing = []
-    for folder in (p.parent for top in house.PACKAGES for p in (ROOT / top).rglob("__init__.py")):
+    for folder in (p.parent for top in size.PACKAGES for p in (ROOT / top).rglob("__init__.py")):
         package = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
         offered = getattr(package, "__all__", ())
         modules = {file.stem for file in folder.glob("*.py")} | {inner.name for inner in folder.iterdir()}

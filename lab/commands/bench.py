@@ -1,4 +1,4 @@
-"""``dehyst bench``: measure the solver beside reference operations and peer packages.
+"""``dehyst bench``: measure the solver beside reference operations.
 
 Needs a checkout of the sources: ``benchmarks/`` is not installed.
 """

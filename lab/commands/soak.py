@@ -13,9 +13,9 @@ from service.cli.options import add_epilog, add_shared, check_seed, progress_pri
 
 EPILOG = """\
 In real time the soak runs these processes on loopback: a router, two services (one a hot standby), a simulated stage, a
-controller, a second client that measures, a bare echo, and the viewer's stream. --fast runs the faults of samples in
-one process. Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results: soak.json (renewed every minute), report.md,
-pictures, and plan.json with every fault as it happened.
+controller, a second client that measures, and the viewer's stream. --fast runs the faults of samples in one process.
+Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results at the end: soak.json with the verdict, report.md, soak.png, and
+plan.json with every fault as it happened. Times are judged as they were measured: leave the machine to the soak.
 
   dehyst soak --duration 5m
   dehyst soak --duration 40s --faults kill_primary,nan,gap --out out/short
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         kinds = tuple(name for name in kinds if FAULT_KINDS[name].fast)
     stop = StopSignal()
     from lab.soak import session as soak
-    from lab.soak.verdict.outcome import HELD, verdict_line
+    from lab.soak.report import HELD, verdict_line
 
     done = soak.run(
         args.out,

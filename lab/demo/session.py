@@ -18,9 +18,10 @@ from adaptive.types import FloatArray
 from lab.demo.controller import KEPT, FollowedModels
 from lab.demo.plan import AXIS, LOCK_STEP_S, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
 from lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
+from lab.loop import Asker, Twins, samples, turns
 from lab.testbed.identified_stage import READY_S, Rig, write_service_config
 from lab.testbed.processes import Child
-from service.client.client import Client, PendingCommands
+from service.client.client import Client
 from service.client.follower import Follower
 from service.config.settings import read_config
 from service.identification.identifying import NAMES, Stretch, identify_all
@@ -28,8 +29,6 @@ from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
 from service.runtime.session import SURELY, open_client, wait_followed
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
@@ -192,22 +191,19 @@ class _Samples:
     """The twin stages of a fast run: drives them block by block, and hands the teacher's samples to ``axis``."""
 
     def __init__(self, plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> None:
-        self.u_V, self.y_um = empty(plan), empty(plan)
+        self._twins = Twins(Stage(plan.stage(changing=True)), tuple(MODELS), plan.ticks)
+        self.u_V, self.y_um = self._twins.u_V, self._twins.y_um
         self.notes: list[Diagnostics] = []
         self._plan, self._axis, self._recorder, self._progress = plan, axis, recorder, progress
         self._wanted_um = plan.reference()[0]
-        self._stage = Stage(plan.stage(changing=True))
-        self._states = {name: self._stage.initial_state() for name in MODELS}
 
-    def drive(self, done: int) -> None:
-        """Run the block of ticks from ``done`` on with its voltages in ``u_V``."""
+    def drive(self, block: int) -> None:
+        """Run the block with this number with its voltages in ``u_V``."""
         plan, axis, size = self._plan, self._axis, self._plan.block
+        done = block * size
         part = slice(done, done + size)
-        for name in MODELS:
-            self.y_um[name][part] = self._stage.run(self._states[name], self.u_V[name][part])[0]
-        seq = np.arange(part.start, part.stop)
-        t_s = seq.astype(np.float64) * plan.dt_s
-        batch = SampleBatch(seq, t_s, self.u_V[TEACHER][part], self.y_um[TEACHER][part])
+        self._twins.run(part)
+        batch = samples(done, plan.dt_s, self.u_V[TEACHER][part], self.y_um[TEACHER][part])
         verdicts = axis.handle(batch)
         self._recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
         if done % 100 == 0 and axis.learner is not None:
@@ -216,7 +212,7 @@ class _Samples:
                 told = {
                     key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
                 }
-            self.notes.append(Diagnostics(float(batch.t_s[-1]), int(seq[-1]), told))
+            self.notes.append(Diagnostics(float(batch.t_s[-1]), int(batch.seq[-1]), told))
         if (done + size) % 1000 == 0:
             tail = slice(max(0, done + size - 1000), done + size)
             errors = {k: float(np.mean(np.abs(self._wanted_um[tail] - self.y_um[k][tail]))) for k in MODELS}
@@ -232,8 +228,8 @@ class _Samples:
 
 def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
     """Run the plan on twin stages; the teacher's samples go into ``axis``."""
-    samples = _Samples(plan, axis, recorder, progress)
-    return (_queried if plan.ahead else _followed)(plan, axis, samples)
+    driven = _Samples(plan, axis, recorder, progress)
+    return (_queried if plan.ahead else _followed)(plan, axis, driven)
 
 
 class _Loopback:
@@ -253,7 +249,7 @@ class _Loopback:
             self._deliver(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
 
 
-def _followed(plan: Plan, axis: Axis, samples: _Samples) -> DemoRun:
+def _followed(plan: Plan, axis: Axis, driven: _Samples) -> DemoRun:
     """By followers that get their models as in real time, message by message."""
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
     loopback, streams = _Loopback(), DeltaStreams(axis)
@@ -269,53 +265,38 @@ def _followed(plan: Plan, axis: Axis, samples: _Samples) -> DemoRun:
             session, "delta" if learns else None, name, payload.__bytes__, axis.limits, deltas=learns, keep=KEPT
         )
     models = FollowedModels(plan, followers)
-    for block in range(n // size + ahead + 1):
-        done = (block - ahead - 1) * size
-        if done >= 0:
-            samples.drive(done)
-            streams.tick((done + size) * plan.dt_s)
-        if block * size >= n:
-            continue
-        for name, begin, u_V in models.constant(block * size):
-            samples.u_V[name][begin : begin + u_V.size] = u_V
-        begin, u_V = models.block(block, block, block + 1)
-        samples.u_V[TEACHER][begin : begin + u_V.size] = u_V
-    return samples.result(models.std_V, models.durations_s, models.counts())
+    for run, asked in turns(n // size, ahead):
+        if run is not None:
+            driven.drive(run)
+            streams.tick((run + 1) * size * plan.dt_s)
+        if asked is not None:
+            for name, begin, u_V in models.constant(asked * size):
+                driven.u_V[name][begin : begin + u_V.size] = u_V
+            begin, u_V = models.block(asked, asked, asked + 1)
+            driven.u_V[TEACHER][begin : begin + u_V.size] = u_V
+    return driven.result(models.std_V, models.durations_s, models.counts())
 
 
-def _queried(plan: Plan, axis: Axis, samples: _Samples) -> DemoRun:
+def _queried(plan: Plan, axis: Axis, driven: _Samples) -> DemoRun:
     """By queries ahead of time."""
     wanted = plan.reference()
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
-    u_V, std_V = samples.u_V, empty(plan)
-    memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
-    commanded = PendingCommands()
-    last_V = {name: float("nan") for name in MODELS}
+    std_V = empty(plan)
+    # The service tracks the teacher's stage; the other models carry their memory in the query.
+    ask = {name: Asker(axis, name, tracked=name == TEACHER) for name in MODELS}
     durations = []
-    for block in range(n // size + ahead + 1):
-        done = (block - ahead - 1) * size
-        if done >= 0:
-            samples.drive(done)
-        if block * size >= n:
+    for run, asked in turns(n // size, ahead):
+        if run is not None:
+            driven.drive(run)
+        if asked is None:
             continue
-        part = slice(block * size, (block + 1) * size)
+        part = slice(asked * size, (asked + 1) * size)
         for name in MODELS:
-            # The service tracks the teacher's stage; the other models carry their memory in the query.
-            pending = commanded.before(part.start) if name == TEACHER else None
-            query = FeedforwardQuery(
-                wanted[0][part], wanted[1][part], wanted[2][part], memory[name], name, plan.as_of(block), last_V[name],
-                pending,
-            )  # fmt: skip
             begin = time.perf_counter()
-            reply = axis.answer(query)
+            reply = ask[name](part.start, [column[part] for column in wanted], plan.as_of(asked))
             durations.append(time.perf_counter() - begin)
-            u_V[name][part], std_V[name][part] = reply.u_V, reply.std_V
-            last_V[name] = float(reply.u_V[-1])
-            if name == TEACHER:
-                commanded.take(part.start, wanted[0][part], reply)
-            else:
-                memory[name] = reply.memory
-    return samples.result(std_V, durations, {})
+            driven.u_V[name][part], std_V[name][part] = reply.u_V, reply.std_V
+    return driven.result(std_V, durations, {})
 
 
 Say = Callable[[str], None]

@@ -10,7 +10,6 @@ See docs/rehearse.md.
 
 from lab.rehearsal.config import RehearsalConfig
 from lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, INTACT, SENSOR, STANDARD, Event, draw
-from lab.rehearsal.loop import LoopRecord
 from lab.rehearsal.outcome import ErrorFigures, HealthyOutcome, Outcome, Trouble
 from lab.rehearsal.plant import (
     Change,
@@ -24,6 +23,7 @@ from lab.rehearsal.plant import (
 )
 from lab.rehearsal.reference import Motion, RandomReference, Reference, ReferenceRequest
 from lab.rehearsal.rehearsal import EventRun, Rehearsal, rehearse, run_event, run_healthy, standard_events
+from lab.rehearsal.runs import LoopRecord
 
 __all__ = [
     "CLASSES",

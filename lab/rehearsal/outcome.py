@@ -10,7 +10,7 @@ import numpy as np
 from adaptive.online.gates import GLITCH, UNTRUSTED
 from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
-from lab.rehearsal.loop import LoopRecord
+from lab.rehearsal.runs import LoopRecord
 from service.answers.guard import Limits
 from service.reports.tables import json_form
 from sim.masks import runs

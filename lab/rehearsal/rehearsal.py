@@ -26,7 +26,6 @@ from lab.rehearsal.disturbance import (
     MessageLine,
     draw,
 )
-from lab.rehearsal.loop import LoopRecord, idle_samples, run_adaptive, run_frozen, times
 from lab.rehearsal.outcome import (
     LARGE_PCT,
     SENSOR_FACTOR,
@@ -38,6 +37,7 @@ from lab.rehearsal.outcome import (
 )
 from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
 from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
+from lab.rehearsal.runs import LoopRecord, idle_samples, run_adaptive, run_frozen, times
 from service.config.settings import LEARN, AxisConfig
 from service.protocol.errors import FieldError
 from service.reports import tables

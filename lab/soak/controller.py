@@ -87,20 +87,22 @@ PERIOD_S = 120.0
 #: Time of the transition between motion and rest, s.
 FADE_S = 0.6
 
-#: A weight and its two derivatives, (n,) each.
-Weight = tuple[FloatArray, FloatArray, FloatArray]
 
+def _rest(k: NDArray[np.int64], start: int, stop: int, width: float) -> FloatArray:
+    """(3, n) weight of the motion with a rest from ``start`` to ``stop``, and its two derivatives per tick.
 
-def fade(q: FloatArray) -> Weight:
-    """Seventh-order step from 0 to 1 over ``q`` in [0, 1], and its two derivatives with respect to ``q``."""
-    q = np.clip(q, 0.0, 1.0)
+    Both transitions are steps of seventh order, ``width`` ticks long, and lie inside.
+    """
+    leaves = k < 0.5 * (start + stop)
+    q = np.clip(np.where(leaves, (k - start) / width, (k - stop) / width + 1.0), 0.0, 1.0)
     s0 = q**4 * (35.0 - 84.0 * q + 70.0 * q**2 - 20.0 * q**3)
     s1 = 140.0 * q**3 * (1.0 - q) ** 3
     s2 = 420.0 * q**2 * (1.0 - q) ** 2 * (1.0 - 2.0 * q)
-    return s0, s1, s2
+    sign = np.where(leaves, -1.0, 1.0)
+    return np.stack((np.where(leaves, 1.0 - s0, s0), sign * s1 / width, sign * s2 / width**2))
 
 
-def _towards(motion: FloatArray, level_um: float, weight: Weight, dt_s: float) -> FloatArray:
+def _towards(motion: FloatArray, level_um: float, weight: FloatArray, dt_s: float) -> FloatArray:
     """(3, n) motion about a level, scaled by a weight with its derivatives per tick (product rule)."""
     w0, w1, w2 = weight[0], weight[1] / dt_s, weight[2] / dt_s**2
     y, v, a = motion[0] - level_um, motion[1], motion[2]
@@ -125,7 +127,9 @@ class SoakReference:
         t_s = np.arange(n).astype(np.float64) * self.dt_s
         made = DemoReference(PERIOD_S, self.low_um, self.high_um, self.seed).at(t_s)
         motion = np.stack((made.y_um, made.v_um_per_s, made.a_um_per_s2))
-        self._motion = _towards(motion, self.low_um, self._turn(np.arange(n), n - 1), self.dt_s)
+        # It moves where one that rests all the time would leave its motion.
+        turn = np.array([[1.0], [0.0], [0.0]]) - _rest(np.arange(n), 0, n - 1, FADE_S / self.dt_s)
+        self._motion = _towards(motion, self.low_um, turn, self.dt_s)
 
     def rows(self, first: int, n: int) -> FloatArray:
         """(3, n) from tick ``first`` on."""
@@ -134,32 +138,8 @@ class SoakReference:
         middle = 0.5 * (self.low_um + self.high_um)
         for start, ticks in self.dwells:
             if start <= k[-1] and k[0] <= start + ticks:
-                motion = _towards(motion, middle, self._rest(k, start, start + ticks), self.dt_s)
+                motion = _towards(motion, middle, _rest(k, start, start + ticks, FADE_S / self.dt_s), self.dt_s)
         return motion
-
-    def _rest(self, k: NDArray[np.int64], start: int, stop: int) -> Weight:
-        """Weight of the motion with a rest from ``start`` to ``stop``; both transitions lie inside."""
-        return self._chosen(k, 0.5 * (start + stop), start, -1.0, stop, 1.0)
-
-    def _turn(self, k: NDArray[np.int64], stop: int) -> Weight:
-        """Weight of the motion with a rest at tick 0 and at ``stop``."""
-        return self._chosen(k, 0.5 * stop, 0, 1.0, stop, -1.0)
-
-    def _chosen(
-        self, k: NDArray[np.int64], middle: float, first: int, sign: float, second: int, other_sign: float
-    ) -> Weight:
-        """Before ``middle`` a transition that begins at ``first``, after it one that ends at ``second``. Signs: in (1)
-        or out (-1)."""
-        width = FADE_S / self.dt_s
-        early = _faded((k - first) / width, sign, width)
-        late = _faded((k - second) / width + 1.0, other_sign, width)
-        return tuple(np.where(k < middle, x, y) for x, y in zip(early, late, strict=True))  # type: ignore[return-value]
-
-
-def _faded(q: FloatArray, sign: float, width: float) -> Weight:
-    """A transition in (sign 1) or out (-1) over q from 0 to 1, ``width`` ticks long, with derivatives per tick."""
-    s0, s1, s2 = fade(q)
-    return (s0 if sign > 0.0 else 1.0 - s0), sign * s1 / width, sign * s2 / width**2
 
 
 #: Timeout of a query, s. The controller asks 60 ms ahead, so it does not wait longer.
@@ -199,7 +179,6 @@ class StageClock:
                 self._moved.notify_all()
 
     def _status(self, sample: zenoh.Sample) -> None:
-
         status = json.loads(sample.payload.to_bytes())
         with self._moved:
             # A restarted stage waits for commands; a stage that runs is followed from its present tick.
@@ -229,16 +208,15 @@ class Controller:
     def __init__(self, control: ControlTask, client: Client, session: zenoh.Session) -> None:
         self.control = control
         self.reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
-        self.counts = {"blocks": 0, "answered": 0, "given_up": 0, "retries": 0, "errors": 0, "fallback": 0, "unsafe": 0}
+        self.counts = {"blocks": 0, "given_up": 0, "retries": 0, "errors": 0, "unsafe": 0}
         self._client = client
         self._session = session
-        self._dwells = session.declare_subscriber(dwell_key(), self._rest)
+        self._dwells = session.declare_subscriber(dwell_key(), self._dwell)
         self._commands = CommandLease(session, Keys(STAGE, AXIS), own_authenticator())
         self._last_V = math.nan
         self._error = ""
 
-    def _rest(self, sample: zenoh.Sample) -> None:
-
+    def _dwell(self, sample: zenoh.Sample) -> None:
         dwell = json.loads(sample.payload.to_bytes())
         self.reference.dwells = [*self.reference.dwells[-8:], (int(dwell["first"]), int(dwell["ticks"]))]
 
@@ -291,9 +269,7 @@ class Controller:
                 continue
             if not clock.before(begin):
                 break
-            self.counts["answered"] += 1
             self.counts["unsafe"] += not self._safe(answer)
-            self.counts["fallback"] += answer.fallback
             self._last_V = float(answer.u_V[-1])
             with contextlib.suppress(zenoh.ZError):
                 self._commands.put(wire.encode_command(begin, answer.u_V))

@@ -54,23 +54,14 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
     "clock_back": FaultKind("the wall clock of the service set back by an hour", MACHINE, (2.0, 4.0), 3.0),
     "disk_full": FaultKind("no more bytes for the recordings", MACHINE, (3.0, 5.0), 10.0),
     "cpu_stolen": FaultKind("a busy process for each core", MACHINE, (1.5, 3.0), 4.0, 0.5),
-    "bad_queries": FaultKind(
-        "a burst of malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0
-    ),
+    "bad_queries": FaultKind("malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0),
     "forged_state": FaultKind(
-        "a stranger that answers standbys with forged states, and asks for the state", PROCESS, (3.0, 4.0), 6.0
+        "a stranger answers standbys with forged states, and asks for it", PROCESS, (3.0, 4.0), 6.0
     ),
     "rogue_claim": FaultKind("a stranger that claims to serve", PROCESS, (3.0, 4.0), 3.0),
-    "folder_removed": FaultKind(
-        "the folders of the serving process' recording and checkpoints are taken away", MACHINE, (3.0, 3.5), 12.0
-    ),
+    "folder_removed": FaultKind("the folders of recording and checkpoints are taken away", MACHINE, (3.0, 3.5), 12.0),
     "freeze_restart": FaultKind(
-        "freeze, kill -9 of the serving process within 20 ms, a step of the readings, thaw",
-        PROCESS,
-        (10.0, 10.0),
-        10.0,
-        0.2,
-        True,
+        "freeze, kill -9, a step of the readings, thaw", PROCESS, (10.0, 10.0), 10.0, 0.2, True
     ),
     "gap": FaultKind("samples that never come", STAGE, (0.3, 2.0), 5.0, fast=True),
     "duplicate": FaultKind("every sample twice", STAGE, (0.5, 2.0), 3.0, fast=True),
@@ -79,12 +70,8 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
     "spike": FaultKind("every 25th reading off by 30 µm", STAGE, (0.5, 2.0), 5.0, fast=True),
     "freeze": FaultKind("a sensor that repeats its last reading", STAGE, (0.5, 2.0), 8.0, fast=True),
     "saturate": FaultKind("a sensor that ends half way", STAGE, (0.5, 2.0), 8.0, fast=True),
-    "stuck_noisy": FaultKind(
-        "a sensor that shows its last reading and 1 pm of noise", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True
-    ),
-    "sensor_gain": FaultKind(
-        "a sensor that shows a multiple of the motion", STAGE, (2.0, 5.0), 2.0, fast=True, sensor=True
-    ),
+    "stuck_noisy": FaultKind("a sensor stuck, with 1 pm of noise", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
+    "sensor_gain": FaultKind("a sensor that shows a multiple", STAGE, (2.0, 5.0), 2.0, fast=True, sensor=True),
     "sign": FaultKind("a sensor with the other sign", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
     "other_stage": FaultKind("the readings of another stage", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
     "seq_jump": FaultKind("one sample with a number far ahead", STAGE, (0.5, 0.5), 2.0, fast=True),
@@ -202,7 +189,6 @@ def _value(name: str, rng: np.random.Generator, turn: int) -> float:
 
 # --- The schedule
 
-
 #: A delay up to this, s, is absorbed by the time between two faults.
 LATE_S: Final = 0.5
 
@@ -211,42 +197,36 @@ class Schedule:
     """The faults of ``plan`` one after the other, each with its time to recover, whatever delays occurred before.
 
     A fault that starts a process begins when that process is ready, and a fault that is not ``possible`` yet waits;
-    all later faults are delayed by as much. A fault that has no time left to recover is left out.
+    those behind it are delayed by as much. A fault that has no time left to recover is left out.
     """
 
     def __init__(self, plan: SoakPlan, possible: Callable[[PlannedFault], bool]) -> None:
-        self._plan, self._possible = plan, possible
-        self._waiting = deque(enumerate(plan.faults))
+        self._duration_s, self._possible = plan.duration_s, possible
+        self._waiting = deque(plan.faults)
         self._delay_s = 0.0
         self._notes: list[str] = []
 
-    def due(self, now_s: float) -> tuple[int, PlannedFault] | None:
-        """The fault that begins at ``now_s``, with its number in the plan; None if there is none."""
-        while self._waiting:
-            index, fault = self._waiting[0]
-            if now_s < fault.at_s + self._delay_s:
-                return None
-            if fault.window_s[1] + self._delay_s > self._plan.duration_s:
-                self._notes.append(_note(fault, "no time to recover"))
-            elif self._possible(fault):
-                self._waiting.popleft()
-                return index, fault
-            else:
+    def due(self, now_s: float) -> PlannedFault | None:
+        """The fault that begins at ``now_s``; None if there is none."""
+        while self._waiting and now_s >= self._waiting[0].at_s + self._delay_s:
+            fault = self._waiting[0]
+            if fault.window_s[1] + self._delay_s <= self._duration_s:
+                if self._possible(fault):
+                    return self._waiting.popleft()
                 self._delay_s = now_s - fault.at_s
                 return None
-            self._waiting.popleft()
+            self._notes.append(_note(self._waiting.popleft(), "no time to recover"))
         return None
 
-    def over(self, index: int, end_s: float) -> None:
-        """Report that fault number ``index`` has ended at ``end_s``."""
-        late_s = end_s - (self._plan.faults[index].end_s + self._delay_s)
+    def over(self, fault: PlannedFault, end_s: float) -> None:
+        """Report that ``fault`` has ended at ``end_s``."""
+        late_s = end_s - (fault.end_s + self._delay_s)
         if late_s > LATE_S:
             self._delay_s += late_s
 
     def left_out(self) -> list[str]:
         """After the run: one line for each fault that did not happen, with the reason."""
-        # Also a fault that waited for the standby until the end, and those after it.
-        return self._notes + [_note(fault, "it did not come to it") for _, fault in self._waiting]
+        return self._notes + [_note(fault, "it did not come to it") for fault in self._waiting]
 
 
 def _note(fault: PlannedFault, why: str) -> str:

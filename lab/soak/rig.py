@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import signal
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -31,8 +30,6 @@ _STARTS, _NUMBERS_PER_START = 1000, 1_000_000_000
 SERVICES: Final = ("a", "b")
 #: Folders of a service; a standby's have a suffix.
 FOLDERS: Final = ("recording", "checkpoints")
-#: Period of the bare paced loop, s.
-_LOOP_STEP_S: Final = 2e-3
 #: Between the last sample and the end of the services, so that they handle what is under way, s.
 _DRAIN_S: Final = 1.0
 
@@ -62,8 +59,7 @@ def identify(config: StageConfig, path: Path, seed: int) -> ControlTask:
 
 
 class SoakRig:
-    """The processes by name: router, a and b (the services), stage, controller, prober, echo, viewer, and a bare paced
-    loop that measures the delays of the machine.
+    """The processes by name: router, a and b (the services), stage, controller, prober, viewer.
 
     Parameters
     ----------
@@ -78,7 +74,6 @@ class SoakRig:
         self.model = model
         self._out, self._stage = out, stage
         self._stage_starts = 0
-        self._strangers = 0
         self._task_file = self.rig.logs / "control.json"
         task.write(self._task_file)
         write_offset(self.wall_clock, 0.0)
@@ -114,11 +109,9 @@ class SoakRig:
         # Start all, then wait for each: most of the time goes into imports.
         for name in SERVICES:
             self.start_service(name, standby=name != SERVICES[0])
-        self.rig.start_echo(wait=False)
-        self.rig.start_paced_loop(_LOOP_STEP_S, wait=False)
         self.start_viewer()
         self.start_stage()
-        self.rig.wait_ready(*SERVICES, "echo", "bare", "viewer")
+        self.rig.wait_ready(*SERVICES, "viewer")
         for name in ("controller", "prober"):
             program = ["-m", f"lab.soak.{name}", str(self._task_file), self.rig.endpoint]
             self.rig.start(name, program, wait=False)
@@ -149,20 +142,13 @@ class SoakRig:
         options = ["--file", str(path), "--endpoint", self.rig.endpoint, "--inject", "--first", str(first)]
         self.rig.start_stage(STAGE, AXIS, *options, "--slew", repr(self.task.slew_V_per_s), wait=False)
 
-    def start_disturber(self, what: str, index: int, *arguments: str) -> Callable[[], None]:
-        """Start a process of `lab.soak.disturbers` and wait until it is ready; returns what ends it."""
-        program = ["-m", "lab.soak.disturbers", what, self.rig.endpoint, *arguments]
-        child = self.rig.start(f"{what}{index}", program)
-        return lambda: child.send(signal.SIGTERM)
-
-    def start_stranger(self, what: str, seed: int, *arguments: str) -> Child:
-        """Start a process of `lab.soak.strangers` and wait until it is ready."""
-        self._strangers += 1
-        program = ["-m", "lab.soak.strangers", what, self.rig.endpoint, str(seed), *arguments]
-        return self.rig.start(f"stranger{self._strangers}", program)
+    def start_helper(self, module: str, name: str, what: str, *arguments: str) -> Child:
+        """Start a process of this package's ``module`` and wait until it is ready."""
+        return self.rig.start(name, ["-m", f"lab.soak.{module}", what, self.rig.endpoint, *arguments])
 
     def take_folders_away(self, name: str, now_s: float) -> list[Path]:
-        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where they were.
+        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where the first
+        were.
 
         What was recorded must still be counted at the end; checkpoints of hours would fill the disk.
         """
@@ -173,7 +159,7 @@ class SoakRig:
             path.rename(away / path.name)
         for path in checkpoints:
             shutil.rmtree(path, ignore_errors=True)
-        return [*recordings, *checkpoints]
+        return recordings
 
     def service_of(self, instance: str) -> str:
         """Name of the service with this instance id, which contains its process id; "" if there is none."""
@@ -184,7 +170,7 @@ class SoakRig:
 
     def stop(self) -> None:
         """Stop clients first, then the stage, then, when the last samples are handled, the services and the router."""
-        services = ("viewer", "echo", "bare", *reversed(SERVICES))
+        services = ("viewer", *reversed(SERVICES))
         for names in (("prober", "controller"), ("stage",), services, ("router",)):
             for name in names:
                 self.children[name].send(signal.SIGINT)

@@ -157,7 +157,6 @@ class Rig:
         how = ["listen", endpoint] if endpoint else ["connect", self.endpoint]
         return self.start("echo", ["-m", "lab.testbed.processes", "echo", *how], wait=wait)
 
-    def start_paced_loop(self, step_s: float, ticks: int | None = None, *, wait: bool = True) -> Child:
+    def start_paced_loop(self, step_s: float, ticks: int, *, wait: bool = True) -> Child:
         """A bare paced loop, see `lab.testbed.processes`."""
-        length = [] if ticks is None else [str(ticks)]
-        return self.start("bare", ["-m", "lab.testbed.processes", "paced_loop", str(step_s), *length], wait=wait)
+        return self.start("bare", ["-m", "lab.testbed.processes", "paced_loop", str(step_s), str(ticks)], wait=wait)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -120,11 +120,6 @@ class Child:
         self._process.wait()
         self._reader.join(5.0)
 
-    def last_line(self) -> str:
-        """The newest output line that was not taken yet; "" for none."""
-        with self._changed:
-            return self.lines[-1] if self.lines else ""
-
     def take_lines(self) -> list[str]:
         """The output lines since the last call. They are dropped here, so that a long run does not collect them."""
         with self._changed:
@@ -186,9 +181,8 @@ class Children:
 # --- Processes that measure the machine beside an experiment: a bare zenoh echo and a bare paced loop.
 #
 # ``python -m lab.testbed.processes echo listen|connect ENDPOINT`` answers queries with as many bytes as asked
-# for: the round trip without a service. ``... paced_loop STEP_S [TICKS]`` only sleeps from tick to tick: how late this
-# machine runs a process that asks for nothing else. Both print ``ready`` and run until stopped (the loop: or for TICKS
-# ticks).
+# for: the round trip without a service. ``... paced_loop STEP_S TICKS`` only sleeps from tick to tick: how late this
+# machine runs a process that asks for nothing else. Both print ``ready``; the echo runs until stopped.
 
 #: Key of the echo; ``echo/BYTES`` asks for a reply of so many bytes.
 ECHO_KEY = "echo"
@@ -219,47 +213,26 @@ def echo(how: str, endpoint: str) -> int:
     return 0
 
 
-def delays(step_s: float, *, catch_up: bool) -> Iterator[tuple[float, float]]:
-    """Sleep from tick to tick and yield (monotonic time, how late the tick came), both s.
+def paced_loop(step_s: float, ticks: int) -> int:
+    """Sleep from tick to tick, and print at the end how many came late by more than a period.
 
-    ``catch_up``: ticks that were missed come one after the other without a pause, as the stage's ticks do. Otherwise a
-    delay moves all later ticks, so that each tick is measured by itself.
+    Ticks that were missed come one after the other without a pause, as the stage's ticks do.
     """
-    start = time.monotonic()
-    tick = 0
-    while True:
-        tick += 1
-        # From the number of the tick, not summed: no drift.
-        due = start + tick * step_s
-        wait_s = due - time.monotonic()
-        if wait_s > 0.0:
-            time.sleep(wait_s)
-        now = time.monotonic()
-        if not catch_up and now - due > step_s:
-            start += now - due - step_s
-        yield now, now - due
-
-
-def paced_loop(step_s: float, ticks: int | None = None) -> int:
-    """Without ``ticks``: print JSON once a second, the time and the largest delay of a tick in it, both s. With them:
-    print at the end how many ticks came late by more than a period."""
     stop = StopSignal()
     print("ready", flush=True)
-    second, worst_s, late = time.monotonic(), 0.0, 0
-    for tick, (now, late_s) in enumerate(delays(step_s, catch_up=ticks is not None), 1):
-        late += late_s > step_s
-        worst_s = max(worst_s, late_s)
-        if ticks is None and now - second >= 1.0:
-            print(json.dumps({"t_s": round(now, 3), "late_s": round(worst_s, 5)}), flush=True)
-            second, worst_s = now, 0.0
-        if stop.reason or tick == ticks:
+    start, late = time.monotonic(), 0
+    for tick in range(1, ticks + 1):
+        # From the number of the tick, not summed: no drift.
+        due = start + tick * step_s
+        time.sleep(max(0.0, due - time.monotonic()))
+        late += time.monotonic() - due > step_s
+        if stop.reason:
             break
-    if ticks is not None:
-        print(json.dumps({"late": late}), flush=True)
+    print(json.dumps({"late": late}), flush=True)
     return 0
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "echo":
         sys.exit(echo(sys.argv[2], sys.argv[3]))
-    sys.exit(paced_loop(float(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else None))
+    sys.exit(paced_loop(float(sys.argv[2]), int(sys.argv[3])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import signal
 import subprocess
@@ -70,32 +69,23 @@ def test_a_killed_primary_and_poisoned_samples_in_real_processes(tmp_path: Path)
     assert done.returncode in (0, 1), done.stderr
     found = read(tmp_path)
     assert found == json.loads(done.stdout)
-    assert set(found) == {
-        "verdict", "not_judged", "duration_s", "faults", "invariants", "latency", "memory_slope_kb_per_hour", "samples"
-    }  # fmt: skip
+    assert set(found) == {"verdict", "not_judged", "duration_s", "faults", "invariants", "latency", "samples"}
     assert {name for name in SAFE if not found["invariants"][name]["held"]} == set(), done.stderr
     assert found["faults"]["kill_primary"]["count"] == found["faults"]["nan"]["count"] == 1
     assert found["faults"]["nan"]["told_by"] == ["samples.gates.not_finite"]
     assert found["faults"]["kill_primary"]["told_by"], "another instance answers"
-    assert found["latency"]["p50_us"] > 0.0 < found["latency"]["echo_p50_us"]
+    assert found["latency"]["p50_us"] > 0.0
     assert found["samples"]["seen"] > 15_000
     assert found["samples"]["in_no_recording_and_no_fault_on"] == 0
-    assert {"memory", "memory_resident"} <= set(found["not_judged"]), "too short a run"
+    assert "memory" in found["not_judged"], "too short a run"
     line = f"{found['verdict']}; not judged: "
     assert line in done.stderr
     assert "memory (too short a run)" in done.stderr
     report = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert report.startswith(f"# Soak: {line}")
-    for name in ("error.png", "latency.png", "memory.png"):
-        assert (tmp_path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-        assert name in report
+    assert (tmp_path / "soak.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert "soak.png" in report
     assert [f["kind"] for f in json.loads((tmp_path / "plan.json").read_text())["faults"]] == ["kill_primary", "nan"]
-    with (tmp_path / "seconds.csv").open(encoding="utf-8") as file:
-        seconds = list(csv.DictReader(file))
-    assert len(seconds) in (26, 27)
-    assert {row["fault"] for row in seconds} == {"", "kill_primary", "nan"}
-    assert sum(int(row["samples"]) for row in seconds) <= found["samples"]["received_by_monitor"]
-    assert sum(int(row["answers"] or 0) for row in seconds) > 100
 
 
 #: What a soak does to processes and to the machine, but for what the test above does.

@@ -15,8 +15,8 @@ from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
 from lab.rehearsal import Event, RehearsalConfig, identify, run_event
 from lab.rehearsal.disturbance import draw
-from lab.rehearsal.loop import LoopRecord
 from lab.rehearsal.plant import IdentifiedPlant
+from lab.rehearsal.runs import LoopRecord
 from service.answers.which_model import NOTHING_LEARNT, VOLTAGE_DIFFERS
 from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch

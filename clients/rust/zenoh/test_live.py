@@ -227,7 +227,7 @@ def test_a_stage_and_a_controller_that_asks_ahead_in_rust_and_in_c(endpoint: str
 
 @pytest.mark.parametrize("threads", [[], ["--receivers"], ["--core", "--warm"]])
 def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint: str, threads: list[str]) -> None:
-    """``python -m benchmarks.native_loop`` compares the two; how many are missed, only a quiet machine can tell."""
+    """How many are missed, only a quiet machine can tell."""
     program = Path(LIBRARY).parent / "deadlines"
     if not program.exists():
         pytest.skip("c/deadlines.c is not built: clients/test.sh does")

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from lab.soak import malformed_client
+from lab.soak import disturbers
 from lab.soak.controller import StageClock
+from lab.soak.disturbers import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
 from lab.soak.fault_plan import FAULT_KINDS
-from lab.soak.malformed_client import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
-from lab.soak.verdict.observations import INDICATORS, assess_recovery
+from lab.soak.observed import INDICATORS
 from service.operating.verbs import decode_request
 from service.protocol import query as wire_query
 from service.protocol import samples as wire
-from tests.lab.soak.soaked import healthy
 
 #: What the promise names, and by which kind it is kept.
 PROMISED = {
@@ -118,15 +117,15 @@ class Session:
 
 def test_rubbish_comes_at_a_bounded_rate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     session, until = Session(), time.monotonic() + 0.5
-    monkeypatch.setattr(malformed_client, "open_client", lambda *_: session)
+    monkeypatch.setattr(disturbers, "open_client", lambda *_: session)
 
     class Stop:
         @property
         def reason(self) -> str:
             return "over" if time.monotonic() > until else ""
 
-    monkeypatch.setattr(malformed_client, "StopSignal", Stop)
-    assert malformed_client.send_malformed("nowhere", "dehyst/soak/x", 1) == 0
+    monkeypatch.setattr(disturbers, "StopSignal", Stop)
+    disturbers.send_malformed("nowhere", "dehyst/soak/x", 1)
     assert 8 < len(session.sent) <= 0.5 * RATE_HZ + 5
     assert {key.rsplit("/", 1)[1].split("?")[0] for key in session.sent} == set(TARGETS)
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -145,15 +144,3 @@ def test_a_controller_follows_the_stage_through_rubbish() -> None:
     clock._sample(message(b"rubbish"))
     clock._sample(message(wire.encode_samples([8], [0.008], [1.0], [2.0])))
     assert clock.newest == 8
-
-
-def test_bad_messages_are_told_where_queries_and_samples_are_counted() -> None:
-    """Of both: a service that counts the queries alone has not told of the samples."""
-    for names, told in ((("queries.errors", "samples.malformed"), True), (("queries.errors",), False)):
-        observed = healthy()
-        observed.faults[0].kind = "bad_queries"
-        for t_s, _, counters in observed.counters:
-            for name in names:
-                counters[name] = 5.0 if t_s > 10.0 else 0.0  # type: ignore[index]
-        assess_recovery(observed)
-        assert bool(observed.faults[0].reported_by) is told

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.soak.actions import FaultActions
 from lab.soak.controller import STRAY, ControlTask, SoakReference
 from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, make_plan
-from lab.soak.live import FaultActions
-from lab.soak.verdict.observations import FaultRecord, SampleTracker, judge_sensor_fault, stage_gain, troubles_since
+from lab.soak.judge import judge_sensor_fault, stage_gain
+from lab.soak.observed import FaultRecord, SampleTracker, troubles_since
 from service.protocol.samples import MAX_SEQ, SampleBatch
 from service.stage_node.faults import Fault, Injector
 from tests.lab.soak.soaked import broken, healthy, verdict
@@ -216,21 +217,20 @@ class Watched:
         self.model = folder / "model.npz"
         self._told, self._folder = told, folder
 
-    @property
-    def statuses(self) -> dict[str, tuple[float, dict[str, Any]]]:
-        return {self.status["instance"]: (0.0, self.status)}
+    def recent(self, _: float) -> list[dict[str, Any]]:
+        return [self.status]
 
     def now(self) -> float:
         return 1.0
 
-    def start_stranger(self, *_: object) -> Stepping:
+    def start_helper(self, *_: object) -> Stepping:
         return Stepping(self._told)
 
     def service_of(self, _: str) -> str:
         return "a"
 
     def take_folders_away(self, *_: object) -> list[Path]:
-        return [self._folder / "recording", self._folder / "checkpoints"]
+        return [self._folder / "recording"]
 
 
 @pytest.mark.parametrize(
@@ -249,12 +249,12 @@ def test_a_stranger_that_gets_or_moves_anything_breaks_the_fault(
 ) -> None:
     watched = Watched(tmp_path, told)
     actions = FaultActions(watched, watched)  # type: ignore[arg-type]
-    actions.begin(0, PlannedFault(kind, 1.0, 3.0))
+    actions.begin(PlannedFault(kind, 1.0, 3.0))
     if "event" in change:
         watched.events.append({"t_s": 0.5, "event": change["event"]})
     else:
         watched.status |= change
-    actions.end(0)
+    actions.end()
     assert [breach for breach in actions.breaches if words in breach] == actions.breaches[:1] if words else True
     assert bool(actions.breaches) is bool(words)
 
@@ -268,11 +268,11 @@ def test_a_folder_that_vanishes_must_be_told_and_made_anew(
 ) -> None:
     watched = Watched(tmp_path, {})
     actions = FaultActions(watched, watched)  # type: ignore[arg-type]
-    actions.begin(0, PlannedFault("folder_removed", 1.0, 3.0))
+    actions.begin(PlannedFault("folder_removed", 1.0, 3.0))
     watched.status["recorder"] = {"degraded": degraded}
     if made:
         (tmp_path / "recording").mkdir()
-    actions.end(0)
+    actions.end()
     assert words in "".join(actions.breaches)
     assert bool(actions.breaches) is bool(words)
 

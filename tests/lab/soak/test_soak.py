@@ -1,18 +1,13 @@
-"""The soak's parts: plans, references, intervals, faults of a stage, what others take of the processor."""
+"""The soak's parts: plans, references, intervals, faults of a stage."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,8 +16,7 @@ from adaptive.errors import InputError
 from lab.commands.soak import seconds
 from lab.soak.controller import PERIOD_S, ControlTask, SoakReference
 from lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
-from lab.soak.machine_load import OtherLoad, processor_times_s
-from lab.soak.verdict.observations import Intervals
+from lab.soak.observed import Intervals
 from service.stage_node.faults import Fault, Injector, decode_fault
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
@@ -102,7 +96,7 @@ def test_intervals_are_a_set_of_integers(parts: list[tuple[int, int]], others: s
     other = Intervals()
     other.add_all(np.array(sorted(others, reverse=True), dtype=np.int64))
     assert {k for a, b in other.spans for k in range(a, b)} == others
-    assert {k for a, b in found.minus(other) for k in range(a, b)} == expected - others
+    assert {k for a, b in found.minus(other).spans for k in range(a, b)} == expected - others
 
 
 # ---- faults of a stage
@@ -196,65 +190,6 @@ def test_a_change_is_made_once_and_a_bad_one_is_counted() -> None:
 def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
     with pytest.raises(InputError, match=f"^{named}: got"):
         decode_fault(payload)
-
-
-@pytest.mark.alone
-def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> None:
-    others = OtherLoad()
-    assert others.share({1: 0.0}) is None, "a moment ago"
-    time.sleep(0.25)
-    assert others.share({1: 0.0}) is None, "the first look only begins"
-    time.sleep(0.25)
-    assert others.share({1: 1e6}) == 0.0, "all of it was one's own"
-    until = time.monotonic() + 0.3
-    while time.monotonic() < until:
-        pass
-    share = others.share({1: 1e6})
-    assert share is not None
-    assert 0.0 < share <= 1.0, "this very loop is none of them"
-
-
-#: Uses up 0.4 s of processor (told in hundredths), tells when it has, and ends when told to.
-CHILD = """
-import sys, time
-while time.process_time() < 0.4:
-    pass
-print("burnt", flush=True)
-sys.stdin.readline()
-"""
-#: Has such a child, and reaps it when told to.
-PARENT = f"""
-import subprocess, sys
-child = subprocess.Popen([sys.executable, "-c", {CHILD!r}], stdin=subprocess.PIPE, text=True, start_new_session=True)
-sys.stdin.readline()
-child.communicate("")
-print("reaped", flush=True)
-sys.stdin.readline()
-"""
-
-
-def test_what_a_process_has_begun_is_its_own_while_it_lives_and_after() -> None:
-    """A service diagnoses and draws in processes of their own: taken for others, its own work would excuse it."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdin=pipe, stdout=pipe, text=True) as parent:
-        assert parent.stdin is not None
-        assert parent.stdout is not None
-        assert parent.stdout.readline() == "burnt\n"
-        living = processor_times_s([parent.pid, os.getpid()])
-        assert living[parent.pid] >= 0.3
-        (child,) = psutil.Process(parent.pid).children()
-        apart = processor_times_s([parent.pid, child.pid])
-        assert apart[child.pid] >= 0.3
-        assert apart[parent.pid] < living[parent.pid], "one that is a root itself is not counted twice"
-        parent.stdin.write("\n")
-        parent.stdin.flush()
-        assert parent.stdout.readline() == "reaped\n"
-        # In ticks of a hundredth: sums of the same ticks in another order differ in the last bit.
-        alive, reaped = (round(100.0 * took[parent.pid]) for took in (living, processor_times_s([parent.pid])))
-        assert alive <= reaped < alive + 30
-    before = processor_times_s([os.getpid()])[os.getpid()]
-    assert before == pytest.approx(sum(psutil.Process().cpu_times()[:2]), abs=0.2), "none that it has outlived"
-    assert parent.pid not in processor_times_s([parent.pid])
 
 
 def test_control_goes_through_its_file(tmp_path: Path) -> None:

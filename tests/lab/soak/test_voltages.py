@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab.soak.controller import AXIS, STAGE, ControlTask
-from lab.soak.verdict.observations import FaultRecord, Monitor, Observations, SampleTracker
+from lab.soak.observed import FaultRecord, Monitor, Observations, SampleTracker
 from service.protocol import samples as wire
 from service.runtime.session import open_router
 from tests.lab.soak.soaked import broken, healthy, verdict
@@ -70,7 +70,7 @@ def test_what_is_safe_breaks_nothing(driven: Driven) -> None:
     driven.send(FIRST + 3, 6.0, 10.0, 6.0)
     driven.run(FIRST + 6)
     assert driven.broken() == set()
-    assert driven.track.seconds[-1].sent_step_V == pytest.approx(4.0)
+    assert driven.track.seconds[-1].step_V == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,6 @@ def test_what_the_stage_clamps_breaks_the_run_as_it_was_sent(
 ) -> None:
     driven.send(FIRST + 3, *block)
     driven.run(FIRST + 3 + (0 if name == "voltages_finite" else len(block)))
-    second = driven.track.seconds[-1]
-    assert (second.not_finite, second.beyond_V <= 0.0, second.step_max_V <= STEP_V) == (0, True, True), "as applied"
     assert driven.broken() == {name}
 
 
@@ -121,13 +119,6 @@ def test_over_samples_without_a_command_the_stage_holds(driven: Driven) -> None:
     assert driven.broken() == {"voltages_within_slew"}
 
 
-def test_what_the_watch_alone_missed_is_told_by_the_stage(driven: Driven) -> None:
-    driven.send(FIRST + 3, 6.0, 10.0, seen=False)
-    driven.send(FIRST + 5, 9.0)
-    driven.run(FIRST + 6)
-    assert driven.broken() == set()
-
-
 def test_while_no_router_is_there_what_was_sent_may_have_come_to_nobody(driven: Driven) -> None:
     driven.send(FIRST + 3, 6.0, 10.0, reaches=False, seen=False)
     driven.send(FIRST + 5, 9.0)
@@ -147,16 +138,6 @@ def test_the_first_block_of_a_life_follows_nothing(driven: Driven) -> None:
     assert driven.broken() == {"voltages_within_slew"}
 
 
-def test_a_controller_that_comes_to_a_running_stage_begins_where_it_stands() -> None:
-    for u_V, found in ((4.0, set()), (4.1, {"voltages_within_slew"})):
-        driven = Driven()
-        driven.now = 45.0
-        driven.run(FIRST + 30)
-        driven.send(FIRST + 60, u_V)
-        driven.run(FIRST + 61)
-        assert driven.broken() == found
-
-
 def test_a_command_that_cannot_be_read_is_no_safe_one(free_port: int) -> None:
     """NaN does not pass the wire's own decoder; that it was sent is what counts."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -167,10 +148,10 @@ def test_a_command_that_cannot_be_read_is_no_safe_one(free_port: int) -> None:
             good = wire.encode_command(FIRST, [0.0, 1.0])
             poisoned = good[:-8] + struct.pack("<d", float("nan"))
             _until(lambda: _sent(server, key, good) and bool(monitor.track.seconds))
-            assert sum(s.sent_not_finite for s in monitor.track.seconds) == 0
+            assert sum(s.not_finite for s in monitor.track.seconds) == 0
             server.put(key, poisoned)
             _until(lambda: monitor.malformed > 0)
-            assert sum(s.sent_not_finite for s in monitor.track.seconds) == 1
+            assert sum(s.not_finite for s in monitor.track.seconds) == 1
             observed: Observations = healthy()
             observed.seconds += monitor.track.seconds
             assert broken(verdict(observed)) == {"voltages_finite"}

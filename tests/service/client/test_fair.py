@@ -51,7 +51,7 @@ def test_points_are_answered_while_others_ask_for_thousands(client: Client, shar
             client.point(40.0)
             points += 1
         asking.join()
-    # One after the other there would be one point at most. How fast they are is for benchmarks/fairness.py to say.
+    # One after the other there would be one point at most.
     assert points > 5
     assert client.status()["queries"]["waiting_points"] == 0
 

@@ -1,7 +1,4 @@
-"""A service that is killed and started again goes on where it was: no record is lost, nothing learnt, no jump.
-
-How soon it serves again is measured by ``python -m benchmarks.restart``.
-"""
+"""A service that is killed and started again goes on where it was: no record is lost, nothing learnt, no jump."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
-"""The closed loop in lockstep: the real axis, queried as a client does it, and a plant.
+"""The runs of a rehearsal: the closed loop over a disturbed plant, and the frozen model beside it, sample by sample.
 
-Time line, blocks of ``block`` samples::
-
-    block j is queried when the axis has handled all samples of the blocks up to j - 2; block j - 1 is pending.
-
-So an answer knows all samples but the last ``block``. Before the first block the stage rests for ``IDLE_S``, and the
-axis gets these samples. Nothing depends on a clock: the same seeds give the same run.
+Before the first block the stage rests for ``IDLE_S``, and the axis gets these samples. A block is asked for while the
+one before it is under way, see `lab.loop`.
 """
 
 from __future__ import annotations
@@ -19,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import FloatArray, InverseModel
+from lab.loop import Asker, turns
 from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
 from lab.rehearsal.reference import Motion
 from service.answers.guard import Limits, guard
-from service.client.client import PendingCommands
-from service.protocol.query import FeedforwardQuery
 from service.server.axis import Axis
 
 #: Called with the samples done.
@@ -111,39 +106,31 @@ def run_adaptive(
     jumps = np.zeros(n, dtype=np.int64)
     verdicts, troubles = _NameCodes(NEVER_CAME), _NameCodes("")
     events: list[tuple[float, str, str]] = []
-    commanded, count = PendingCommands(), _NumberOffset(first_number)
-    before_V, newest = u_before_V, -1  # the last sample of the rest
-    for first in range(0, n + block, block):
-        part, held = slice(first, first + block), slice(first - block, first)
-        if first < n:
-            begin = first + count.offset
+    ask, count = Asker(axis, u_before_V=u_before_V), _NumberOffset(first_number)
+    newest = -1  # the last sample of the rest
+    for run, asked in turns(n // block, 1):
+        if run is not None:
+            part = slice(run * block, (run + 1) * block)
+            true_um[part], now_um = plant.run(part.start, u_V[part])
+            read_um[part] = sensor.read(part.start, now_um)
+            message = line.carry(part.start, u_V[part], read_um[part])
+            if message is not None:
+                for tick, said in zip(message.tick.tolist(), axis.handle(message.batch), strict=True):
+                    verdict[tick] = verdicts(said)
+                newest = part.stop - 1
+                count.follow(message)
+            # Known from the end of the block on; until then the value before.
+            trouble[part] = trouble[part.start - 1] if part.start else 0
+            trouble[part.stop - 1] = troubles(axis.newest.trouble)
+            jumps[part] = axis.learner.counters().get("jumps", 0) if axis.learner is not None else 0
+            events += [((part.stop - 1) * dt_s, *_name_and_detail(event)) for event in axis.take_events()]
+            progress(part.stop)
+        if asked is not None:
+            part = slice(asked * block, (asked + 1) * block)
             # The block before is pending; the newest sample that can have come is that of the block before it.
-            axis.update_age(max(0, first - block - 1 - newest) * dt_s)
-            y_um, v_um_per_s, a_um_per_s2 = (values[part] for values in wanted)
-            query = FeedforwardQuery(
-                y_um, v_um_per_s, a_um_per_s2, u_before_V=before_V, pending=commanded.before(begin)
-            )
-            reply = axis.answer(query)
+            axis.update_age(max(0, part.start - block - 1 - newest) * dt_s)
+            reply = ask(part.start + count.offset, [values[part] for values in wanted])
             u_V[part], flags[part] = reply.u_V, reply.flags
-            before_V = float(reply.u_V[-1])
-            commanded.take(begin, y_um, reply)
-            true_um[part], now_um = plant.run(first, u_V[part])
-            read_um[part] = sensor.read(first, now_um)
-        if first == 0:
-            continue
-        # The samples of the block before arrive while this block is computed.
-        message = line.carry(held.start, u_V[held], read_um[held])
-        if message is not None:
-            for tick, said in zip(message.tick.tolist(), axis.handle(message.batch), strict=True):
-                verdict[tick] = verdicts(said)
-            newest = held.stop - 1
-            count.follow(message)
-        # Known from the end of the block on; until then the value before.
-        trouble[held] = trouble[held.start - 1] if held.start else 0
-        trouble[held.stop - 1] = troubles(axis.newest.trouble)
-        jumps[held] = axis.learner.counters().get("jumps", 0) if axis.learner is not None else 0
-        events += [((held.stop - 1) * dt_s, *_name_and_detail(event)) for event in axis.take_events()]
-        progress(held.stop)
     return LoopRecord(
         times(n, dt_s), wanted.y_um, true_um, read_um, u_V, flags, verdict, verdicts.known, trouble,
         troubles.known, jumps, tuple(events),

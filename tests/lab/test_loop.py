@@ -1,0 +1,74 @@
+"""The one closed loop: what is asked for when, and how one answer continues the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lab.loop import Asker, Twins, samples, turns
+from service.answers.guard import Limits
+from service.config.settings import AxisConfig
+from service.server.axis import Axis
+from service.server.axis_loading import load_axis
+from service.storage.model_file import Bundle, BundleMeta
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+from tests.service.conftest import DT_S, make_models
+
+LIMITS = Limits(0.0, 10.0, 2000.0)
+BLOCK = 20
+
+
+@given(blocks=st.integers(0, 40), ahead=st.integers(0, 6))
+def test_a_block_is_asked_for_when_those_before_the_blocks_under_way_have_run(blocks: int, ahead: int) -> None:
+    run: list[int] = []
+    asked: list[int] = []
+    for done, due in turns(blocks, ahead):
+        if done is not None:
+            assert done in asked
+            run.append(done)
+        if due is not None:
+            assert run == list(range(max(0, due - ahead)))
+            asked.append(due)
+    assert run == asked == list(range(blocks))
+
+
+def an_axis() -> Axis:
+    bundle = Bundle(make_models(), BundleMeta("loop", "x", DT_S))
+    return load_axis("loop", AxisConfig("x", Path("model"), LIMITS, snapshot_every=BLOCK), bundle=bundle)
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_each_answer_continues_the_one_before(tracked: bool) -> None:
+    """In voltage, by the slew limit, and in memory: the answer for a point depends on the way to it."""
+    axis = an_axis()
+    ask = Asker(axis, tracked=tracked, u_before_V=0.0)
+    level, still = np.full(BLOCK, 30.0), np.zeros(BLOCK)
+    step_V = LIMITS.slew_V_per_s * DT_S * (1.0 + 1e-9)
+    before_V, ends = 0.0, []
+    for block, y_um in enumerate((level, level + 20.0, level)):
+        answer = ask(block * BLOCK, (y_um, still, still))
+        assert np.abs(np.diff(answer.u_V, prepend=before_V)).max() <= step_V
+        before_V = float(answer.u_V[-1])
+        ends.append(before_V)
+    assert ends[2] < ends[0] < ends[1], "hysteresis: the way back needs less voltage"
+    alone = Asker(axis, tracked=tracked, u_before_V=0.0)(0, (level, still, still))
+    assert float(alone.u_V[-1]) == ends[0]
+
+
+def test_twins_run_alike_by_their_own_voltages() -> None:
+    twins = Twins(Stage(preset("rich")), ("one", "other"), 100)
+    for name in twins.u_V:
+        twins.u_V[name][:] = 3.0
+    twins.u_V["other"][50:] = 4.0
+    for first in range(0, 100, BLOCK):
+        twins.run(slice(first, first + BLOCK))
+    one, other = twins.y_um.values()
+    np.testing.assert_array_equal(one[:50], other[:50])
+    assert other[-1] > one[-1] + 1.0
+    batch = samples(60, 1e-3, twins.u_V["one"][60:80], one[60:80])
+    assert (batch.seq[0], batch.t_s[0], len(batch)) == (60, 0.06, 20)
