@@ -135,7 +135,7 @@ def test_samples_are_accounted_for() -> None:
 def test_memory_in_use_is_compared_with_that_after_the_warm_up(grows_mb: float, held: bool) -> None:
     def grows(k: int, status: dict[str, Any]) -> None:
         # All that is taken in the warm-up, and for a moment, is no growth.
-        mb = 100.0 + min(k, 180) + grows_mb * (k > 700) + 50.0 * (k % 97 == 0)
+        mb = 100.0 + min(k, 180) + grows_mb * (k > 700) + 50.0 * (k in (185, 999))
         status["memory"] = {"malloc_bytes": mb * 2**20, "python_blocks": 10}
 
     found = verdict(healthy(1000, grows))
