@@ -322,9 +322,9 @@ class Follower:
 
     def wait(self, seq: int, timeout_s: float) -> bool:
         """Wait until the newest state has seen sample ``seq``; False if it has not after ``timeout_s``."""
-        seq, timeout_s = check_seq("seq", seq), waiting_time("timeout_s", timeout_s)
+        least, timeout_s = number("seq", seq), waiting_time("timeout_s", timeout_s)
         with self._moved:
-            return self._moved.wait_for(lambda: self.snapshot_seq >= seq, timeout_s)
+            return self._moved.wait_for(lambda: self.snapshot_seq >= least, timeout_s)
 
     def answer(self, query: FeedforwardQuery) -> Trajectory:
         """What the service would answer to ``query`` from this model; changes nothing here.
