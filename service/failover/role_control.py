@@ -137,7 +137,7 @@ class RoleControl:
         self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=False)
         self.settled = threading.Event()
         self.ready = threading.Event()
-        server.synced = False
+        server.set_synced(False)
         server.loop.set_gate(self.model.gate)
 
     def start(self) -> None:
@@ -201,7 +201,7 @@ class RoleControl:
         if claims.refused and not server.claims_refused:
             detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
             server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
-        server.claims_refused = claims.refused
+        server.set_claims_refused(claims.refused)
         highest = claims.highest()
         if server.role == PRIMARY:
             if highest is None or highest < Claim(server.epoch, server.instance):
@@ -280,7 +280,7 @@ class RoleControl:
     def _claim(self) -> None:
         """Declare a claim above all known ones, then withdraw the previous one."""
         server, before = self.server, self._token
-        server.epoch = max(server.epoch + 1, self.claims.next_epoch())
+        server.set_epoch(max(server.epoch + 1, self.claims.next_epoch()))
         claim = Claim(server.epoch, server.instance)
         self._token = self._session.liveliness().declare_token(claim.key(server.authenticator, server.keys))
         if before is not None:
@@ -301,7 +301,7 @@ class RoleControl:
         server.serve()
         server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
-        server.synced = True
+        server.set_synced(True)
         self.settled.set()
         self.ready.set()
 
@@ -309,7 +309,7 @@ class RoleControl:
         server = self.server
         server.axis.note("stood_down", f"{other.instance} serves: it took over while this instance was unreachable")
         # First: the status must not claim that this is the served model.
-        server.synced = False
+        server.set_synced(False)
         server.stand_down()
         self._drop_claim()
         self._rival_at = None
@@ -365,5 +365,5 @@ class RoleControl:
         if not self._outdated:  # no verb came while it was sent
             self._switch = None
         self._refusal = ""
-        server.synced = True
+        server.set_synced(True)
         self.ready.set()

@@ -155,6 +155,18 @@ class AxisServer:
         if self.loop.retuner is not None:
             self.loop.retuner.leave()
 
+    def set_synced(self, synced: bool) -> None:
+        """Whether the model is the one to be served."""
+        self.synced = synced
+
+    def set_epoch(self, epoch: int) -> None:
+        """The number of this instance's take-over."""
+        self.epoch = epoch
+
+    def set_claims_refused(self, count: int) -> None:
+        """How many claims were ignored because they prove nothing."""
+        self.claims_refused = count
+
     def declare(self) -> None:
         """Take samples and serve."""
         self.listen()

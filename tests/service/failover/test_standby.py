@@ -88,7 +88,8 @@ def test_the_standby_takes_over_and_the_one_that_comes_back_stands_by(tmp_path: 
         assert asker.step_V < 0.15
         status = client.status()
         assert (status["role"], status["epoch"], status["instance"]) == ("primary", 2, second)
-        assert status["samples"]["lost"] <= 100
+        # The stage connects anew in half that time.
+        assert status["samples"]["lost"] <= 500 * limit_s
 
         # It comes back, meets the one that serves, and stands by, with the model of that one.
         processes.append(Process(*serve))
