@@ -570,7 +570,11 @@ def nominal_dt(source: str, t_s: FloatArray) -> float:
     steps = np.diff(t_s)
     steps = steps[np.isfinite(steps) & (steps > 0.0)]
     if not len(steps):
-        raise InputError(f"{source}: t_s: got a time that never increases, expected increasing times in s")
+        raise MissingError(
+            f"{source}: t_s: got a time that never increases, expected increasing times in s: add --rate HZ or --dt-s",
+            "the time, which never increases: the rate as --rate HZ",
+            "--rate HZ",
+        )
     rough = float(np.median(steps))
     # Gaps and doubled stamps would bias the mean.
     good = steps[np.abs(steps - rough) < 0.5 * rough]
