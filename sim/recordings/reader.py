@@ -351,9 +351,11 @@ class _Reading:
         """What is missing for the time, where other things are missing too."""
         if self.main.dt_s is not None or self.main.clocks:
             return []
-        lengths = [array.shape[0] for array in self.main.arrays.values() if array.ndim]
+        n = max((array.shape[0] for array in self.main.arrays.values() if array.ndim), default=0)
+        if n < 2:
+            return []
         try:
-            self._time(self.main.source, max(lengths, default=0), [])
+            self._time(self.main.source, n, [])
         except MissingError as error:
             return [error]
         except InputError:
