@@ -122,6 +122,8 @@ def continued(
     the memory. Raises InputError if both ``memory`` and ``begin`` are given.
     """
     u_before_V = number("u_before_V", u_before_V)
+    if not (after is None or isinstance(after, Answer)):
+        raise FieldError("after", repr(after)[:80], "the answer to a point or a trajectory")
     if begin is not None:
         begin = check_seq("begin", begin)
         if memory is not None:
@@ -369,6 +371,16 @@ class RetryingQueries:
 
 # --- The client.
 
+
+def _path(field: str, path: object) -> Path | None:
+    """``path`` as a path, None as it is. Raises InputError for all that is none."""
+    if path is None or isinstance(path, Path):
+        return path
+    if not isinstance(path, str):
+        raise FieldError(field, repr(path)[:80], "the path of a file")
+    return Path(path)
+
+
 #: Longest time until an open session knows what is declared at its other end, s; until then queries get no reply.
 _SETTLE_S: Final = 0.5
 _SETTLE_PAUSE_S: Final = 0.05
@@ -407,9 +419,9 @@ class Client:
         axis: str = "x",
         timeout_s: float = 1.0,
         wait_s: float = 0.0,
-        zenoh_config: Path | None = None,
+        zenoh_config: Path | str | None = None,
         retry_s: float = RETRY_S,
-        key: Path | None = None,
+        key: Path | str | None = None,
     ) -> Client:
         """Connect to the service at ``endpoint``, or to one of several, and check that it serves this axis.
 
@@ -424,6 +436,7 @@ class Client:
         Raises SessionError if the endpoint does not answer, NoReplyError if the axis is not served there.
         """
         keys = Keys(stage, axis)
+        key, zenoh_config = _path("key", key), _path("zenoh_config", zenoh_config)
         timeout_s, retry_s = waiting_time("timeout_s", timeout_s), waiting_time("retry_s", retry_s)
         wait_s = waiting_time("wait_s", wait_s)
         until = time.monotonic() + max(wait_s, _SETTLE_S)
@@ -562,6 +575,8 @@ class Client:
         """
         if not isinstance(model, str):
             raise FieldError("model", repr(model)[:80], "a name, or an empty text for the default")
+        if check_seq("keep", keep) < 1:
+            raise FieldError("keep", keep, "1 state or more")
         status = self._known().status
         name = model or str(status["served"])
 

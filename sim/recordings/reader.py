@@ -351,9 +351,11 @@ class _Reading:
         """What is missing for the time, where other things are missing too."""
         if self.main.dt_s is not None or self.main.clocks:
             return []
-        lengths = [array.shape[0] for array in self.main.arrays.values() if array.ndim]
+        n = max((array.shape[0] for array in self.main.arrays.values() if array.ndim), default=0)
+        if n < 2:
+            return []
         try:
-            self._time(self.main.source, max(lengths, default=0), [])
+            self._time(self.main.source, n, [])
         except MissingError as error:
             return [error]
         except InputError:
@@ -570,7 +572,11 @@ def nominal_dt(source: str, t_s: FloatArray) -> float:
     steps = np.diff(t_s)
     steps = steps[np.isfinite(steps) & (steps > 0.0)]
     if not len(steps):
-        raise InputError(f"{source}: t_s: got a time that never increases, expected increasing times in s")
+        raise MissingError(
+            f"{source}: t_s: got a time that never increases, expected increasing times in s: add --rate HZ or --dt-s",
+            "the time, which never increases: the rate as --rate HZ",
+            "--rate HZ",
+        )
     rough = float(np.median(steps))
     # Gaps and doubled stamps would bias the mean.
     good = steps[np.abs(steps - rough) < 0.5 * rough]

@@ -235,6 +235,12 @@ def test_what_is_not_even_sent(client: Client) -> None:
         client.reference(-1, [1.0])
 
 
+def test_the_key_may_be_a_text(shared_service: Any) -> None:
+    path = str(own_authenticator().path)
+    with Client.connect(shared_service.endpoint, timeout_s=5.0, key=path) as client:
+        assert client.point(40.0).u_V > 0.0
+
+
 @pytest.mark.parametrize("wrong", ["40", None, [1.5], {}], ids=repr)
 def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> None:
     for field, ask in (
@@ -252,6 +258,12 @@ def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> N
         with pytest.raises(InputError, match=f"^{field}: got "):
             ask()
     if wrong is not None:
+        for field in ("keep", "memory"):
+            if (field, wrong) != ("memory", [1.5]):
+                with pytest.raises(InputError, match=f"^{field}: got "):
+                    client.follow(**{field: wrong})
+        with pytest.raises(InputError, match=r"^after: got "):
+            client.trajectory([40.0], after=wrong)
         with pytest.raises(InputError, match=r"^begin: got "):
             client.point(40.0, begin=wrong)
         with pytest.raises(InputError, match=r"^model: got "):
@@ -291,6 +303,10 @@ def test_nobody_there(free_port: int) -> None:
     for wrong in ("localhost", None, 7447, [7447], []):
         with pytest.raises(InputError, match=r"^endpoint: got "):
             Client.connect(wrong)  # type: ignore[arg-type]
+    for field in ("key", "zenoh_config"):
+        for wrong in (b"a.key", 1.5, ["a.key"], {}):
+            with pytest.raises(InputError, match=f"^{field}: got "):
+                Client.connect(f"tcp/127.0.0.1:{free_port}", **{field: wrong})  # type: ignore[arg-type]
     for field in ("timeout_s", "wait_s", "retry_s"):
         for wrong in ("1", None, [1.5], -1.0, float("nan")):
             with pytest.raises(InputError, match=f"^{field}: got "):

@@ -502,6 +502,13 @@ def test_the_days_of_a_spreadsheet_are_a_time(tmp_path: Path) -> None:
     assert_read(recording)
 
 
+def test_a_date_without_a_time_of_day_asks_for_the_rate(tmp_path: Path) -> None:
+    workbook(tmp_path / "a.xlsx", [["Date", "Drive", "Sensor"], *([datetime(2026, 1, 1), u, y] for _, u, y in TABLE)])
+    recording, tries = second_try(tmp_path / "a.xlsx", {"HZ": "1000"})
+    assert tries == 2
+    assert_read(recording)
+
+
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("names", [("C1--stage--0.csv", "C2--stage--0.csv"), ("F0001CH1.csv", "F0001CH2.csv")])
 def test_the_other_channels_file_is_proposed(tmp_path: Path, names: tuple[str, str], first: int) -> None:
