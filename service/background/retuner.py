@@ -69,41 +69,33 @@ class Retuned:
 
 
 class Adoptions:
-    """Pending adoptions of an axis. Any thread may add; the thread that handles samples applies."""
+    """Pending adoptions of an axis. Any thread may add; the thread that handles samples applies.
+
+    Attributes
+    ----------
+    pending : those that wait, in the order of their samples. adopted, refused : counts of the others.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         # Replaced as a whole, so that the check at each sample needs no lock.
-        self._pending: tuple[Retuned, ...] = ()
+        self.pending: tuple[Retuned, ...] = ()
         self.adopted = 0
         self.refused = 0
-
-    @property
-    def pending(self) -> tuple[Retuned, ...]:
-        """Pending adoptions, in the order of their samples."""
-        return self._pending
-
-    def replace(self, pending: Sequence[Retuned]) -> None:
-        """Continue with the pending adoptions of another axis or of a stored state."""
-        with self._lock:
-            self._pending = tuple(sorted(pending, key=lambda entry: entry.seq))
-
-    def __bool__(self) -> bool:
-        return bool(self._pending)
 
     def add(self, *retuned: Retuned) -> None:
         """Schedule adoptions at their samples; one whose sample has passed is applied at the next sample."""
         with self._lock:
-            merged = {entry.seq: entry for entry in (*self._pending, *retuned)}
-            self._pending = tuple(merged[seq] for seq in sorted(merged))
+            merged = {entry.seq: entry for entry in (*self.pending, *retuned)}
+            self.pending = tuple(merged[seq] for seq in sorted(merged))
 
     def apply(self, seq: int, learner: OnlineModel) -> list[tuple[Retuned, str]]:
         """Apply the adoptions due after the sample ``seq``; returns each with "" or the reason for a refusal."""
-        if not self._pending or self._pending[0].seq > seq:
+        if not self.pending or self.pending[0].seq > seq:
             return []
         with self._lock:
-            due = [entry for entry in self._pending if entry.seq <= seq]
-            self._pending = self._pending[len(due) :]
+            due = [entry for entry in self.pending if entry.seq <= seq]
+            self.pending = self.pending[len(due) :]
         done = []
         for entry in due:
             refused = learner.adopt(entry.hyper)

@@ -96,7 +96,8 @@ class _Collector:
         )
         for status in self._statuses:
             labels = _labels(status)
-            which.add_metric((*labels, str(status.get("answering", "unknown"))), 1.0)
+            if answering := status.get("answering"):
+                which.add_metric((*labels, str(answering)), 1.0)
             if name := str(status.get("trouble") or ""):
                 trouble.add_metric((*labels, name, str(status.get("trouble_why", ""))), 1.0)
             gates = status.get("samples", {}).get("gates", {})

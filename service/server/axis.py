@@ -447,7 +447,7 @@ class Axis:
             said = self._teach(sample)
             verdict = self._counted(NOT_COMMANDED if commanded is not None and said not in UNUSABLE else said)
             verdicts.append(verdict)
-            if self.supervisor.adoptions:
+            if self.supervisor.adoptions.pending:
                 self.supervisor.adopt_due(number)
             self.supervisor.watch.take(u_V, y_um, verdict)
             if verdict not in UNUSABLE:

@@ -173,6 +173,7 @@ class World:
         # One change is allowed: to the learner's own model, once it has gone back to before a fault of the sensor.
         changes = [a["fingerprint"] != b["fingerprint"] for a, b in pairwise(alone)]
         assert sum(changes) <= 1, "and was not taught any more"
+        self.until(lambda s, a: s["answering"] == "stand_in", FAULT_S, "the status says so")
         # It stays so for as long as it is wrong, or nearly: the fault began a little before its effect.
         assert is_told(self.look()[0])
 

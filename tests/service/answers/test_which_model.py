@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from adaptive.inverse_model import LssvmInverse
@@ -28,6 +29,8 @@ from service.answers.which_model import (
     rule_of,
     seen_in,
 )
+from service.client.follower import Follower
+from service.protocol.model import Safety, StandIn, encode_model
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
 from tests.service.conftest import DT_S, make_models
 
@@ -85,6 +88,20 @@ def test_flags_of_a_point_and_who_gave_it_say_the_same() -> None:
     assert answering(seen_in(BLENDED, second)) is Answering.BLENDED
     assert answering(seen_in(STAND_IN | NOT_FINITE_REPLACED, None)) is Answering.STAND_IN
     assert answering(seen_in(NOT_FINITE_REPLACED, None)) is Answering.HELD
+
+
+@pytest.mark.parametrize(
+    ("trust", "trouble", "answers"),
+    [(1.0, "", Answering.LEARNT), (1.0, "rail", Answering.IDENTIFIED), (1.0, "sensor_sign", Answering.LAST_GOOD),
+     (0.5, "sensor_sign", Answering.BLENDED), (0.0, "sensor_sign", Answering.STAND_IN)],
+)  # fmt: skip
+def test_a_follower_says_it_of_its_last_voltage(trust: float, trouble: str, answers: Answering) -> None:
+    stand_in = StandIn("linear", make_models()["linear"], np.empty(0))
+    safety = Safety(blends=True, trust=trust, stand_in=stand_in, trouble=trouble)
+    payload = encode_model("lssvm_adaptive", IDENTIFIED, 7, IDENTIFIED.rest_memory(40.0), safety)
+    follower = Follower(None, None, "lssvm_adaptive", lambda: payload, LIMITS)
+    follower.point(40.0)
+    assert follower.answering is answers
 
 
 def test_every_trouble_of_the_learner_has_a_rule_and_every_rule_is_on_both_pages() -> None:

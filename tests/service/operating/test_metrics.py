@@ -30,7 +30,8 @@ def status(**more: Any) -> dict[str, Any]:
     samples = {"received": 1000, "learnt": 90, "lost": 1, "thinned": 2, "dropped": 3, "malformed": 4, "waiting": 5}
     return {
         "stage": "demo", "axis": "x", "role": "primary", "instance": "i1", "state": "ok", "state_reason": "",
-        "trouble": "", "trust": 0.75, "frozen": False, "stale": False, "thinning": 1, "rate_per_s": 999.5,
+        "trouble": "", "trust": 0.75, "answering": "last_good", "frozen": False, "stale": False, "thinning": 1,
+        "rate_per_s": 999.5,
         "sample_age_s": None,
         "samples": {**samples, "gates": {"learnt": 90, "glitch": 7}},
         "quality": {"recent_rms_error_pct": 0.02, "fallback": 0.0},
@@ -52,6 +53,7 @@ def test_the_page_has_every_axis_with_its_labels() -> None:
     assert found["dehyst_up"] == 2
     assert found[f"dehyst_samples_received_total{{{x}}}"] == 1000
     assert found[f"dehyst_trust_ratio{{{x}}}"] == 0.75
+    assert found[f'dehyst_answering{{answering="last_good",{x}}}'] == 1
     assert found[f"dehyst_healthy{{{x}}}"] == 1
     assert found[f"dehyst_healthy{{{y}}}"] == 0
     assert found[f'dehyst_samples_verdict_total{{{x},verdict="glitch"}}'] == 7

@@ -431,7 +431,7 @@ def test_adoptions_are_made_once_in_order_at_their_sample(bundle: Bundle, tmp_pa
     made = {seq: [entry.seq for entry, _ in adoptions.apply(seq, learner)] for seq in range(9, 40)}
     assert {seq: entries for seq, entries in made.items() if entries} == {10: [10], 20: [20], 30: [30]}
     assert learner.taken == [1.0, 2.0, 3.0]
-    assert (adoptions.adopted, adoptions.refused, bool(adoptions)) == (2, 1, False)
+    assert (adoptions.adopted, adoptions.refused, adoptions.pending) == (2, 1, ())
     for retuned in (Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))):
         append_adoption(tmp_path, retuned)
     assert list(read_adoptions(tmp_path)) == [Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))]
