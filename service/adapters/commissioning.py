@@ -424,15 +424,15 @@ def drives(rest_V: float, limits: Limits, dt_s: float) -> tuple[FloatArray, slic
     held = low_V + span_V * (held - held.min()) / np.ptp(held)
     wave = ramps([rest_V, *(low_V + share * span_V for share in _STAIRS)], dt_s, speed, _STAIR_S)[0]
     begins = []
-    for part in (excitation(low_V, high_V, 1.0 / dt_s, _TRAIN_S), sweep, held, np.full(1, rest_V)):
+    for part in (sweep, excitation(low_V, high_V, 1.0 / dt_s, _TRAIN_S), held, np.full(1, rest_V)):
         way = ramps([float(wave[-1]), float(part[0])], dt_s, speed, _STAIR_S)[0]
         begins.append(wave.size + way.size)
         wave = np.concatenate([wave, way, part])
-    return wave, slice(begins[1], begins[1] + sweep.size), begins[2]
+    return wave, slice(begins[0], begins[0] + sweep.size), begins[2]
 
 
 def response(piece: Piece, where: slice, dt_s: float) -> tuple[float | None, float | None]:
-    """(lag, s; first mode, Hz) of the stage by its answer to a sweep; None where it is not seen."""
+    """(lag of a reading behind its voltage, s; first mode, Hz) by the answer to a sweep; None where it is not seen."""
     k, u_V, y_um, timely = (values[where] for values in piece)
     good = timely & np.isfinite(y_um)
     if np.count_nonzero(good) < 0.5 * good.size:
@@ -456,9 +456,7 @@ def response(piece: Piece, where: slice, dt_s: float) -> tuple[float | None, flo
     mode = size[peak] > _PEAK * float(np.median(size[: max(1, size.size // 4)])) and peak < size.size - 3
     below = slice(0, max(4, int(np.searchsorted(hz, 0.5 * hz[peak])))) if mode else slice(None)
     turn = np.unwrap(np.angle(transfer * np.sign(transfer[0].real)))[below]
-    # A voltage is held for a sample time: on average it is half of one old.
-    lag_s = -float(np.polyfit(hz[below], turn, 1)[0]) / (2.0 * math.pi) - 0.5 * dt_s
-    return lag_s, float(hz[peak]) if mode else None
+    return -float(np.polyfit(hz[below], turn, 1)[0]) / (2.0 * math.pi), float(hz[peak]) if mode else None
 
 
 class _Identification:

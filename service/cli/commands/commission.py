@@ -85,7 +85,7 @@ def text(report: dict[str, Any]) -> str:
             f"gain       {report['gain_um_per_V']:.4g} µm/V over {report['range_um']:.4g} µm",
             f"sign, unit {'+' if report['gain_um_per_V'] > 0 else '-'}, µm; checked by {report['checked']}",
             f"hysteresis {100 * report['hysteresis']:.3g} % of the motion",
-            f"lag        {'not seen' if lag is None else f'{1e3 * lag:.3g} ms'}",
+            f"lag        {'not seen' if lag is None else f'{1e3 * lag:.3g} ms from a voltage to its reading'}",
             f"first mode {f'none up to {top:.3g} Hz' if mode is None else f'{mode:.3g} Hz'}",
             f"noise      {1e3 * report['noise_um']:.3g} nm",
             f"error      {report['error_um']:.3g} µm, {report['error_pct']:.3g} % of the range, of {report['model']} "

@@ -27,6 +27,7 @@ from service.adapters.simulated_pi import SimulatedPi
 from service.answers.guard import Limits
 from service.config.settings import read_config
 from service.storage.model_file import read_bundle
+from tests.service.conftest import unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
 LIMITS = Limits(0.0, 80.0, 400.0)
@@ -155,28 +156,49 @@ def test_a_controller_that_is_gone_leaves_its_voltage_and_that_is_said(tmp_path:
     assert "the voltage stays, last known at" in report["fault"]["rest"]
 
 
+def stage_file(folder: Path, port: int) -> list[str]:
+    """Arguments of the command for a stage at this port, whose file it writes."""
+    stage = f"PiStage('127.0.0.1', port={port}, rate_Hz=50.0)"
+    program = f"from service.adapters.pi import PiStage\ndef open_stage():\n    return {stage}\n"
+    (folder / "mine.py").write_text(program)
+    return ["--adapter", "mine.py:open_stage", "--u-min", "0", "--u-max", "80", "--slew", "400", "--out", "out"]
+
+
+@needs_pipython
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_the_command_takes_three_minutes_at_most_and_its_model_is_served(tmp_path: Path) -> None:
+    """With a target that a loaded machine reaches, where many samples come late."""
+    with controller() as (_, port):
+        done = subprocess.run(
+            [sys.executable, "-m", "service.cli", "commission", *stage_file(tmp_path, port), "--target", "2"],
+            cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=300,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^sign, unit \+, µm; checked by the controller's travel$", done.stdout, re.M)
+    assert re.search(r"^hysteresis 1\d\.?\d* % of the motion$", done.stdout, re.M)
+    out = tmp_path / "out"
+    assert json.loads((out / "report.json").read_text())["seconds"] <= 180.0
+    config = out / "serve.toml"
+    config.write_text(config.read_text().replace("7447", str(unused_port())))
+    with subprocess.Popen(
+        [sys.executable, "-m", "service.cli", "serve", "--config", str(config)],
+        cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
+    ) as service:  # fmt: skip
+        assert service.stdout is not None
+        assert service.stdout.readline().startswith("ready")
+        service.send_signal(signal.SIGINT)
+        assert service.wait(60) == 0
+
+
 @needs_pipython
 @pytest.mark.e2e
 @pytest.mark.slow
 def test_ctrl_c_ramps_the_stage_back_and_keeps_the_recording(tmp_path: Path) -> None:
     with controller() as (_, port):
-        stage = f"PiStage('127.0.0.1', port={port}, rate_Hz=50.0)"
-        program = f"from service.adapters.pi import PiStage\ndef open_stage():\n    return {stage}\n"
-        (tmp_path / "mine.py").write_text(program)
-        arguments = [
-            "--adapter",
-            "mine.py:open_stage",
-            "--u-min",
-            "0",
-            "--u-max",
-            "80",
-            "--slew",
-            "100",
-            "--out",
-            "out",
-        ]
         with subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "commission", *arguments],
+            [sys.executable, "-m", "service.cli", "commission", *stage_file(tmp_path, port)],
             cwd=tmp_path, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True,
         ) as process:  # fmt: skip
             assert process.stderr is not None
@@ -264,22 +286,24 @@ class Direct:
 def test_a_stage_is_identified_within_three_minutes_and_ready_to_serve(clock: Clock, tmp_path: Path) -> None:
     stage, said = Direct(), []
     report = commission(lambda: stage, Order(LIMITS, axis="y"), tmp_path, say=said.append)
-    assert (report["fault"], report["in_the_way"], report["rounds"]) == (None, [], 1), report
+    assert (report["fault"], report["in_the_way"]) == (None, []), report
     kept_within(stage.written, LIMITS, 100.0)
     assert stage.closed == 1
-    # 65 s of motion leave enough of the three minutes for the identification.
+    # A round after 25 s of pulses; the three minutes leave as much for the identification.
+    assert report["rounds"] == 1
     assert 60.0 < report["seconds"] < 90.0
     assert 0.9 < report["gain_um_per_V"] < 1.2
     assert 0.1 < report["hysteresis"] < 0.17
     assert 0.004 < report["noise_um"] < 0.009
     assert report["error_pct"] < 0.2
     assert report["checked"] == "the controller's travel"
-    # The sensor's 0.3 ms, the amplifier's 0.06 ms, and up to 1 ms of the simulation's step.
-    assert 0.0 < report["lag_s"] < 2e-3
+    # The readings show the voltage of the sample before; sensor and amplifier add half a millisecond at most.
+    assert 0.009 < report["lag_s"] < 0.0105
     assert report["mode_Hz"] is None
-    # Motion was looked for from a few mV on.
-    small = [u for u in stage.written if 0.0 < u < 0.01]
-    assert max(small[:50]) == 0.005
+    # Motion was looked for from a few mV on, and seen before a tenth of a volt.
+    tops = [b for a, b, c in zip(stage.written, stage.written[1:], stage.written[2:], strict=False) if a < b == c]
+    assert [u for u in tops if u > 0.0][:2] == [0.0025, 0.005]
+    assert re.search(r"^motion seen at \d\d mV", "\n".join(said), re.M)
     (axis,) = read_config(tmp_path / "serve.toml").axes
     assert (axis.name, axis.limits.u_max_V, axis.limits.slew_V_per_s) == ("y", 80.0, 400.0)
     bundle = read_bundle(tmp_path / "stage.npz")
@@ -404,7 +428,7 @@ def test_a_sweep_shows_lag_and_first_mode() -> None:
     piece = Piece(np.arange(t.size), u_V, y_um, timely)
     lag_s, mode = response(piece, slice(0, t.size), 1.0 / rate_Hz)
     assert mode == pytest.approx(mode_Hz, rel=0.03)
-    # The delay, and 2 zeta / omega of the mode.
-    assert lag_s == pytest.approx(late / rate_Hz + 0.1 / w, abs=3e-4)
+    # The delay, 2 zeta / omega of the mode, and half a sample time for which a voltage is held.
+    assert lag_s == pytest.approx((late + 0.5) / rate_Hz + 0.1 / w, abs=2e-4)
     still = Piece(np.arange(t.size), u_V, np.random.default_rng(2).normal(0.0, 0.005, t.size), timely)
     assert response(still, slice(0, t.size), 1.0 / rate_Hz) == (None, None)
