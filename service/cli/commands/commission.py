@@ -22,8 +22,6 @@ dehyst serve) and report.json. Exit status: 0 the target is met, 1 a fault, or w
 
   dehyst commission --adapter examples/my_stage.py:open_stage --u-min 0 --u-max 80 --slew 400 --out commissioned
 """
-#: Files that the command writes; it removes those of an earlier run first.
-OURS = ("recording.csv", "stage.npz", "serve.toml", "report.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Commission. Returns 0 if the target is met, 130 if stopped by a signal, else 1."""
-    from service.adapters.commissioning import Order, commission
+    from service.adapters.commissioning import FILES, Order, commission
     from service.answers.guard import Limits
     from service.runtime.stopping import StopSignal
     from service.storage.output import clear_output
@@ -65,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     opener = load_object("--adapter", args.adapter, "examples/my_stage.py:open_stage")
     if not callable(opener):
         raise FieldError("--adapter", args.adapter, "a function without arguments that opens the adapter")
-    clear_output(args.out, OURS)
+    clear_output(args.out, FILES)
     # Not by KeyboardInterrupt: a vendor's library that catches all exceptions would swallow it.
     stop = StopSignal()
     report = commission(opener, order, args.out, lambda: stop.reason, progress_printer(args.quiet))
