@@ -55,7 +55,7 @@ class Fault:
     drop_s: float = math.inf
 
 
-#: Faults by name, for ``--fault`` and the tests of `service.adapters.commissioning`.
+#: Faults by name, for ``--fault`` and the tests of `service.commissioning.commission`.
 FAULTS: Final = {
     "sign": Fault(scale=-1.0),
     "unit": Fault(scale=1000.0),

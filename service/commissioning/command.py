@@ -45,8 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Commission. Returns 0 if the target is met, 130 if stopped by a signal, else 1."""
-    from service.adapters.commissioning import FILES, Order, commission
     from service.answers.guard import Limits
+    from service.commissioning.commission import FILES, commission
+    from service.commissioning.mover import Order
     from service.runtime.stopping import StopSignal
     from service.storage.output import clear_output
 

@@ -19,12 +19,15 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from service.adapters import adapter, commissioning, simulated_pi
+from service.adapters import adapter, simulated_pi
 from service.adapters.adapter import AdapterError, Stated
-from service.adapters.commissioning import Order, Piece, commission, response
 from service.adapters.pi import PiStage
 from service.adapters.simulated_pi import SimulatedPi
 from service.answers.guard import Limits
+from service.commissioning import commission as rounds
+from service.commissioning import mover
+from service.commissioning.commission import commission, response
+from service.commissioning.mover import Order, Piece, StageFault
 from service.config.settings import read_config
 from service.storage.model_file import read_bundle
 from tests.service.conftest import unused_port
@@ -124,7 +127,7 @@ def test_a_fault_is_named_and_the_stage_goes_back_to_rest(
 @pytest.mark.timeout(400)
 def test_noise_fifty_times_too_large_stands_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, shorter_s in (("_TRAIN_S", 8.0), ("_SWEEP_S", 2.0), ("_HELD_S", 6.0)):
-        monkeypatch.setattr(commissioning, name, shorter_s)
+        monkeypatch.setattr(rounds, name, shorter_s)
     written: list[float] = []
     with controller("--fault", "noise") as (_, port):
         report = commission(opener(port, written), Order(LIMITS, duration_s=300.0), tmp_path)
@@ -238,10 +241,10 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (adapter, commissioning, simulated_pi):
+    for module in (adapter, rounds, mover, simulated_pi):
         monkeypatch.setattr(module, "time", clock)
     # The identification takes real time.
-    monkeypatch.setattr(commissioning._Identification, "done", lambda self: self._process.wait() is not None)
+    monkeypatch.setattr(rounds._Identification, "done", lambda self: self._process.wait() is not None)
     return clock
 
 
@@ -329,9 +332,9 @@ def test_every_voltage_keeps_the_envelope_from_wherever_the_stage_rests(
     stage, limits = Direct(50.0, rest_V=rest_V), Limits(0.0, 80.0, 60.0)
 
     def fails(*_: object) -> None:
-        raise commissioning.StageFault("failed", "no identification here")
+        raise StageFault("failed", "no identification here")
 
-    monkeypatch.setattr(commissioning, "_Identification", fails)
+    monkeypatch.setattr(rounds, "_Identification", fails)
     fault = faulty(stage, tmp_path, Order(limits))
     assert fault["message"] == "no identification here"
     kept_within(stage.written, limits, 50.0, rest_V)
