@@ -46,10 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Commission. Returns 0 if the target is met, 130 if stopped by a signal, else 1."""
     from service.answers.guard import Limits
-    from service.commissioning.commission import FILES, commission
+    from service.commissioning.commission import commission
     from service.commissioning.mover import Order
     from service.runtime.stopping import StopSignal
-    from service.storage.output import clear_output
 
     check_name("--stage", args.stage)
     check_name("--axis", args.axis)
@@ -64,7 +63,6 @@ def run(args: argparse.Namespace) -> int:
     opener = load_object("--adapter", args.adapter, "examples/my_stage.py:open_stage")
     if not callable(opener):
         raise FieldError("--adapter", args.adapter, "a function without arguments that opens the adapter")
-    clear_output(args.out, FILES)
     # Not by KeyboardInterrupt: a vendor's library that catches all exceptions would swallow it.
     stop = StopSignal()
     report = commission(opener, order, args.out, lambda: stop.reason, progress_printer(args.quiet))

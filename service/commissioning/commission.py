@@ -30,7 +30,7 @@ from service.adapters.recording import StageRecording, excitation, write_recordi
 from service.answers.guard import Limits
 from service.commissioning.mover import Following, Mover, Order, Piece, StageFault
 from service.commissioning.probe import Probed, probe, ramps
-from service.storage.output import atomic_write
+from service.storage.output import atomic_write, check_folder, clear_output
 from sim.signals.voltages import generalisation_input
 
 #: Names of the files.
@@ -131,17 +131,20 @@ def commission(
 ) -> dict[str, Any]:  # fmt: skip
     """Commission a stage; returns the report, which is also ``report.json`` in the folder ``out``.
 
-    ``out`` gets ``recording.csv``, and with a model ``stage.npz`` and ``serve.toml``. ``stopped`` : the reason to stop,
-    "" for none. ``report["fault"]`` is None, or ``kind``, ``message`` and ``rest``, where the stage is now; without a
-    fault ``report["in_the_way"]`` says what keeps the error above the target.
+    ``out`` is made where it is missing and loses what an earlier commissioning left. It gets ``recording.csv`` and,
+    with a model, ``stage.npz`` and ``serve.toml``. ``stopped`` : the reason to stop, "" for none. ``report["fault"]``
+    is None, or ``kind``, ``message`` and ``rest``, where the stage is now; without a fault ``report["in_the_way"]``
+    says what keeps the error above the target.
 
     Raises FieldError on limits that do not fit, before anything moves, and what ``open_stage`` raises.
     """
+    check_folder(out)
     begun = time.perf_counter()
     mover = Mover(open_stage, order.limits, stopped, begun + order.duration_s)
     report: dict[str, Any] = {"fault": None, "limits": order.limits.to_json(), "target_pct": order.target_pct}
     report["rest_V"] = mover.rest_V
     try:
+        clear_output(out, FILES)
         _commission(mover, order, out, begun, report, say)
     except BaseException as error:
         rest = mover.back()

@@ -24,11 +24,13 @@ from service.adapters.adapter import AdapterError, Stated
 from service.adapters.pi import PiStage
 from service.adapters.simulated_pi import SimulatedPi
 from service.answers.guard import Limits
+from service.cli.main import main
 from service.commissioning import commission as rounds
 from service.commissioning import mover
 from service.commissioning.commission import commission, response
 from service.commissioning.mover import Order, Piece, StageFault
 from service.config.settings import read_config
+from service.runtime.stopping import STOPS
 from service.storage.model_file import read_bundle
 from tests.service.conftest import unused_port
 
@@ -355,6 +357,20 @@ def test_opening_writes_nothing_and_limits_that_do_not_fit_are_refused(clock: Cl
         assert (stage.written, stage.closed) == ([], 1)
     with pytest.raises(InputError, match="expected a StageAdapter"):
         commission(lambda: 3, Order(LIMITS), tmp_path)  # type: ignore[arg-type,return-value]
+
+
+def test_results_of_before_stay_where_no_stage_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.py").write_text("def open_stage():\n    raise OSError('no such device')\n")
+    (tmp_path / "report.json").write_text("{}")
+    words = ["--adapter", f"{tmp_path / 'mine.py'}:open_stage", "--u-min", "0", "--u-max", "80", "--slew", "10"]
+    before = {number: signal.getsignal(number) for number in STOPS}
+    try:
+        assert main(["commission", *words, "--out", str(tmp_path)]) == 2
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert "open_stage: OSError: no such device" in capsys.readouterr().err
+    assert (tmp_path / "report.json").read_text() == "{}"
 
 
 def test_sign_and_unit_are_checked_against_what_is_stated(clock: Clock, tmp_path: Path) -> None:
