@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import math
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import DehystError, InputError
+from adaptive.errors import InputError
 from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
+from service.cli.python_file import load_object
 from service.protocol.errors import FieldError
 from service.runtime.stopping import StopSignal
 
@@ -69,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     config = RehearsalConfig(settle_s=args.settle, after_s=args.after)
     names = args.events.split(",") if args.events else STANDARD
     events = standard_events(args.seed, config.settle_s, names)
-    given = load_plant(args.plant)
+    given = load_object("--plant", args.plant, "examples/plant.py:Stage")
     factory = factory_of(given, 1.0 / args.rate if args.rate else None, args.u_min, args.u_max)
     clear_output(args.out, OURS)
     begin = time.perf_counter()
@@ -106,38 +105,3 @@ def run(args: argparse.Namespace) -> int:
 def failed(marks: list[str]) -> bool:
     """Whether a remark is more than an event of the axis."""
     return any(not mark.startswith("said: ") for mark in marks)
-
-
-def load_plant(where: str) -> object:
-    """The object FILE.py:NAME. Raises FieldError where file or name is missing, or the file fails."""
-    file, colon, name = where.rpartition(":")
-    if not (colon and file and name.isidentifier()):
-        raise FieldError("--plant", repr(where), "FILE.py:NAME", "for instance examples/plant.py:Stage")
-    path = Path(file)
-    if not path.is_file():
-        raise FieldError("--plant", f"{file}, which is not there", "a Python file")
-    spec = importlib.util.spec_from_file_location("dehyst_plant", path)
-    if spec is None or spec.loader is None:
-        raise FieldError("--plant", file, "a Python file, its name ending in .py")
-    module = importlib.util.module_from_spec(spec)
-    # As for a script, imports from its folder work, and the module can be found by its name.
-    sys.modules[spec.name] = module
-    sys.path.insert(0, str(path.resolve().parent))
-    try:
-        spec.loader.exec_module(module)
-    except DehystError:
-        raise
-    except Exception as error:
-        raise FieldError(
-            "--plant",
-            f"{file}: {type(error).__name__}: {error}",
-            "a file that Python runs to its end",
-            "correct the file",
-        ) from error
-    if not hasattr(module, name):
-        known = [key for key, value in vars(module).items() if not key.startswith("_") and callable(value)]
-        raise FieldError(
-            "--plant", f"{name!r}, which is not in {file}", f"one of {', '.join(known) or 'nothing there'}"
-        )
-    found: object = getattr(module, name)
-    return found

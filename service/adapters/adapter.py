@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from adaptive.errors import DehystError
 from service.protocol.errors import FieldError
@@ -17,6 +17,7 @@ class AdapterError(DehystError):
     """The controller of a stage, or the library that speaks to it, is missing or does not answer."""
 
 
+@runtime_checkable
 class StageAdapter(Protocol):
     """One axis of a real stage in open loop: its sensor is read, its voltage is set. One thread calls it.
 
@@ -49,6 +50,27 @@ class StageAdapter(Protocol):
 
     def close(self) -> None:
         """Release the controller. The voltage stays as it is."""
+        ...
+
+
+class Stated(NamedTuple):
+    """What a controller says about its axis.
+
+    servo : it holds positions in closed loop. unit : of its positions, "" where it does not say.
+    travel : length of its travel in that unit, from the lowest to the highest voltage; NaN where it does not say.
+    """
+
+    servo: bool
+    unit: str
+    travel: float
+
+
+@runtime_checkable
+class StatesAxis(Protocol):
+    """The ability of an adapter whose controller can be asked about its axis, for `commission`."""
+
+    def stated(self) -> Stated:
+        """What the controller says now. Raises AdapterError where it does not answer."""
         ...
 
 

@@ -1,17 +1,20 @@
 """Adapter of a piezo controller of Physik Instrumente (PI) that speaks GCS over TCP/IP, through PI's `pipython`.
 
 **Not tried on hardware**: tested against a simulated controller that answers the GCS commands used here (``*IDN?``,
-``SVO``, ``SVA``, ``POS?``, ``VOL?``, ``VMI?``, ``VMA?``, ``ERR?``). Needs the extra ``hardware``.
+``SVO``, ``SVA``, ``SVO?``, ``POS?``, ``VOL?``, ``VMI?``, ``VMA?``, ``PUN?``, ``TMN?``, ``TMX?``, ``ERR?``). Needs the
+extra ``hardware``.
 
 Sources: documentation of PI's General Command Set (GCS 2.0), docstrings of pipython 2.11.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from service.adapters.adapter import AdapterError, check_rate, load_library
+from service.adapters.adapter import AdapterError, Stated, check_rate, load_library
 
 _PORT = 50_000
 
@@ -46,8 +49,13 @@ class PiStage:
             """The library closes its socket again when the device is collected, which raises."""
 
             def close(self) -> None:
-                if self.connected:
+                if not self.connected:
+                    return
+                try:
                     super().close()
+                except OSError:  # the controller has closed it, and the library stops half way
+                    self._socket.close()
+                    self.call_connection_status_changed_callback(self)
 
         try:
             gateway = ClosedOnce(host=host, port=port)
@@ -76,6 +84,21 @@ class PiStage:
     def applied_V(self) -> float:
         """The voltage of the piezo output, V (``VOL?``)."""
         return float(self._device.qVOL(self._channel)[self._channel])
+
+    def stated(self) -> Stated:
+        """Servo (``SVO?``), unit of the positions (``PUN?``) and travel (``TMX?`` - ``TMN?``) by the controller."""
+        device = self._device
+        servo = bool(device.qSVO(self._axis)[self._axis])
+        unit = str(self._said(device.qPUN) or "").strip()
+        low, high = self._said(device.qTMN), self._said(device.qTMX)
+        return Stated(servo, unit, math.nan if low is None or high is None else float(high) - float(low))
+
+    def _said(self, query: Callable[[str], Any]) -> Any:
+        """The reply to a query; None from a controller that does not know it."""
+        try:
+            return query(self._axis)[self._axis]
+        except Exception:
+            return None
 
     def close(self) -> None:
         """Close the connection; the voltage stays."""

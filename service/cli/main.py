@@ -120,6 +120,13 @@ COMMANDS: Final[dict[str, Command]] = {
     "access": _command(
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),
+    "commission": Command(
+        "service.commissioning.command",
+        IDENTIFICATION,
+        "move a stage through its adapter, and identify it",
+        (SERVE,),
+        True,
+    ),
     "identify": _command(
         "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
     ),

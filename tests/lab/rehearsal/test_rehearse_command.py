@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from lab.cli import main
-from lab.commands.rehearse import failed, load_plant
+from lab.commands.rehearse import failed
 from lab.rehearsal.rehearsal import remarks
+from service.cli.python_file import load_object
 
 ROOT = Path(__file__).resolve().parents[3]
 #: Rate-dependent in nothing, and fast: two plays in a line, a sample late.
@@ -127,7 +128,7 @@ def test_the_example_is_a_plant() -> None:
 
     from lab.rehearsal import factory_of
 
-    made = factory_of(load_plant(f"{ROOT / 'examples' / 'plant.py'}:Stage"))()
+    made = factory_of(load_object("--plant", f"{ROOT / 'examples' / 'plant.py'}:Stage", ""))()
     true_um, read_um = made.run(np.linspace(0.0, 50.0, 200))
     assert 25.0 < true_um[-1] < 35.0
     assert 0.0 < np.abs(read_um - true_um).max() < 0.03
@@ -137,7 +138,7 @@ def test_readings_of_another_stage_steer_the_example_nowhere() -> None:
     """They move as fast as the stage for 64 ms, and were once taken for a shift of its zero."""
     from lab.rehearsal import factory_of, rehearse, standard_events
 
-    made = factory_of(load_plant(f"{ROOT / 'examples' / 'plant.py'}:Stage"))
+    made = factory_of(load_object("--plant", f"{ROOT / 'examples' / 'plant.py'}:Stage", ""))
     event = standard_events(0, 4.0)[-1]
     assert event.kind == "foreign"
     done = rehearse(made, events=[event])

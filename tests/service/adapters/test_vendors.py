@@ -16,7 +16,7 @@ import pytest
 
 from adaptive.errors import InputError
 from service.adapters import simulated_pi
-from service.adapters.adapter import AdapterError, StageAdapter
+from service.adapters.adapter import AdapterError, StageAdapter, Stated
 from service.adapters.jena import Nv200Stage
 from service.adapters.ni import NiStage
 from service.adapters.pi import PiStage
@@ -74,6 +74,7 @@ def test_a_pi_controller_is_read_and_driven_by_gcs(pi_port: int) -> None:
         with PiStage("127.0.0.1", port=pi_port, rate_Hz=100.0, check_errors=check_errors) as stage:
             assert "E-709" in stage.identity
             assert (stage.rate_Hz, stage.u_min_V, stage.u_max_V) == (100.0, -20.0, 100.0)
+            assert stage.stated() == Stated(False, "um", 100.0)
             at_its_limits(stage)
             before_um = stage.read_um()
             stage.write_V(60.0)

@@ -1,0 +1,1 @@
+"""Identification of a stage on live hardware, through its adapter: ``dehyst commission``."""
