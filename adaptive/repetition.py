@@ -29,9 +29,10 @@ GROWTH: Final = 0.95
 #: What a design bears: the model's slope is off by this share, its lag by this share and half a sample.
 SLOPE_ERROR: Final = 0.3
 LAG_ERROR: Final = 0.25
-#: Half length of the low-pass as a multiple of 1 / cut-off, and the shape of its Kaiser window (45 dB).
-_HALF: Final = 2.0
-_KAISER: Final = 4.0
+#: Half length of the low-pass as a multiple of 1 / cut-off, and the shape of its Kaiser window: 70 dB, because what the
+#: low-pass is off by at the frequency of the motion is an error of the whole motion.
+_HALF: Final = 3.0
+_KAISER: Final = 7.0
 #: Cut-offs that are tried, as shares of the lowest mode and of the sample rate.
 _OF_MODE: Final = 0.9
 _OF_RATE: Final = 0.35
@@ -70,7 +71,8 @@ def growth(cutoff: float, half: int, lag_s: float, mode_Hz: float, dt_s: float) 
     `LEAST_DAMPING` or more at ``mode_Hz`` or anywhere above it. Up to ``mode_Hz`` the mode lifts the response by
     1 / (1 - (f / mode)²) at most; from there on it may be 1 / (2 damping) at any phase.
     """
-    f = np.linspace(0.0, 0.5, _FREQUENCIES)
+    # Close enough about the mode, however slow it is beside the samples.
+    f = np.concatenate([np.linspace(0.0, top, _FREQUENCIES) for top in (min(2.0 * mode_Hz * dt_s, 0.5), 0.5)])
     x = np.arange(-half, half + 1)
     low_pass = np.abs(np.cos(2.0 * np.pi * np.outer(f, x)) @ kernel(0.0, cutoff, half)[1])
     share = f / (mode_Hz * dt_s)
