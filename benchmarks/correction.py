@@ -40,7 +40,7 @@ from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
 from lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
 from lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
 from service.answers.guard import Limits
-from service.client.correcting import Correcting
+from service.client.correcting import Answer, Correcting
 from service.client.follower import Follower
 from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.config.settings import LEARN, AxisConfig
@@ -102,10 +102,10 @@ class Unbounded(Correcting):
         super().__init__(replace(config, share=1.0), limits, dt_s)
 
     def voltage(
-        self, first: int, model: Any, points: Any, memory: FloatArray, std_V: float, trouble: str = ""
-    ) -> float:
+        self, first: int, model: Any, points: Any, memory: FloatArray, answer: Answer, trouble: str = ""
+    ) -> FloatArray:
         """As of a model of unknown error, whatever the service says."""
-        return super().voltage(first, model, points, memory, math.inf)
+        return super().voltage(first, model, points, memory, (answer[0], math.inf))
 
 
 class FittedStack:

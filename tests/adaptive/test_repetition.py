@@ -1,4 +1,4 @@
-"""The correction of motion that repeats: its low-pass, its convergence in frequency and in simulated passes, periods."""
+"""The correction of motion that repeats: its low-pass, its convergence in frequency and in passes, and periods."""
 
 from __future__ import annotations
 
