@@ -27,7 +27,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from adaptive.correction import Correction, sensitivity
+from adaptive.correction.integral import Correction, sensitivity
 from adaptive.identification import identify_lssvm
 from adaptive.types import FloatArray
 from baselines.prandtl_ishlinskii.identify import identify_mpi

@@ -11,8 +11,8 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.correction import Correction, sensitivity
-from adaptive.repetition import Repetition
+from adaptive.correction.integral import Correction, sensitivity
+from adaptive.correction.repetition import Repetition
 from adaptive.types import FloatArray, InverseModel
 from service.answers.guard import Limits
 from service.config.correction import CorrectionConfig, RepetitionConfig

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from adaptive.errors import InputError
-from adaptive.repetition import (
+from adaptive.correction.repetition import (
     GAIN,
     GROWTH,
     KEPT,
@@ -23,6 +22,7 @@ from adaptive.repetition import (
     growth,
     kernel,
 )
+from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
 DT_S = st.sampled_from([1e-4, 2e-4, 5e-4, 1e-3, 2e-3])

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adaptive.correction import LEAST_DAMPING
+from adaptive.correction.integral import LEAST_DAMPING
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
