@@ -164,8 +164,6 @@ def _refined(y_um: FloatArray, period: float, w: int) -> float | None:
 
 #: Residual of a pass, as a multiple of the smallest so far, from which on what was learnt is wrong.
 _GROWN: Final = 3.0
-#: Share of doubted readings in a pass from which on nothing is begun.
-_WRONG: Final = 0.1
 #: A single residual counts by so many times their root mean square at most.
 _SPIKE: Final = 4.0
 #: Passes without growth after which a halved gain doubles again.
@@ -225,7 +223,7 @@ class Repetition:
         self._look_at = self._next + 2 * _SHORTEST
         self._span = 0.0
         self._weight, self._fade_V = 0.0, abs(self.u_V)
-        self._missing, self._wrong = 0, 0.0
+        self._missing = 0
         self._power = self._least = math.nan
         self._quiet = 0
 
@@ -279,7 +277,6 @@ class Repetition:
             return
         r_V = self._slope * residual_um
         doubted = not (abs(r_V) <= self._bound_V and self._slope)
-        self._wrong += (doubted - self._wrong) / (self.period or KEPT)
         self.doubted += doubted
         self._missing = self._missing + 1 if doubted else 0
         if not doubted:
@@ -371,8 +368,10 @@ class Repetition:
         span = float(np.ptp(self._y[k : i + 1])) if not self.active else self._span
         if abs(self._y.item(i) - before) > SAME * span + 0.5 * way:
             self._forget()
-        elif not self.active and self._passes:
-            # The first pass is left out: hysteresis and creep of a motion that has begun are not yet those of the next.
-            first = number - self._at_w - 2 * self.design.half
-            if first > self._same_since + self.period and self._wrong < _WRONG:
-                self.active, self._span = True, span
+            return
+        # The first pass is left out: hysteresis and creep of a motion that has begun are not yet those of the next.
+        back = self._at_w + 2 * self.design.half if self._passes else KEPT
+        if number - back <= self._same_since + self.period:
+            self.release()  # older readings or another lag may need more than there is
+        elif not self.active:
+            self.active, self._span = True, span

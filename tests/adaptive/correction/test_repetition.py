@@ -163,7 +163,7 @@ class Loop:
             errors.append(abs(y - true))
             self.u += (1.0 - math.exp(-1.0)) * (2.0 * gain * (answer + added) - self.u)
             self.k += 1
-        n = int(passes)
+        n = max(int(passes), 1)
         return np.array([np.mean(part) for part in np.array_split(errors[: round(n * self.period)], n)])
 
 
@@ -274,6 +274,19 @@ def test_what_is_kept_goes_on_beyond_its_end_and_a_gap_begins_anew() -> None:
     assert np.abs(np.diff(np.array(loop.added[-2000:]))).max() < 0.05
     loop.repetition.add(loop.k + 50, 0.0, 0.0)
     assert not loop.repetition.active
+
+
+def test_readings_that_come_later_than_before_change_the_pass_that_teaches() -> None:
+    """Begun just now, with readings 1 sample old; of readings 60 samples old the last pass has too few."""
+    loop = Loop(66.6667)
+    while not loop.repetition.active:
+        loop.run(1 / 66.0)
+    loop.age = 60
+    loop.run(1 / 66.0)
+    assert not loop.repetition.active
+    errors = loop.run(20)
+    assert loop.repetition.active
+    assert errors[-1] < 0.05 * errors[0]
 
 
 def test_the_correction_keeps_its_bound() -> None:
