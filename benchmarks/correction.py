@@ -374,10 +374,10 @@ def lines(course: Course, got: Record) -> Record:
     return {"lines": [float(error[line == k].mean()) for k in range(LINES)], **counts}
 
 
-def run_rasters(course: Course, ages: Sequence[int] = AGES) -> list[Record]:
+def run_rasters(course: Course, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:
     """All runs of a stage along rasters; a run that raises has its traceback."""
     records = []
-    for frequency_Hz, age, way in itertools.product(RASTERS_HZ, ages, RASTER_WAYS):
+    for frequency_Hz, age, way in itertools.product(RASTERS_HZ, ages, ways):
         there = course.raster(frequency_Hz)
         record: Record = {
             "seed": course.seed, "case": RASTER, "way": way, "age": age, "frequency_Hz": frequency_Hz,
@@ -440,11 +440,11 @@ def raster_table(records: Sequence[Record]) -> str:
                 cells = (_text(errors[:, line - 1]) for line in SHOWN)
                 rows.append((f"{frequency_Hz:g}", str(age), way, *cells))
         ours, rival, harder = (found[way] for way in ("repetition", "iterative", "frozen+iterative"))
-        if ours.size:
+        if ours.size and rival.size:
             first, tenth = ours[:, 0] / rival[:, 0], ours[:, 9] / rival[:, 9]
             goals.append(
                 (f"{frequency_Hz:g}", str(age), _text(tenth, 2), f"{int((tenth <= 1.0).sum())} of {stages}",
-                 _text(ours[:, 9] / harder[:, 9], 2), _text(first, 2), f"{int((first <= 0.2).sum())} of {stages}")
+                 _text(ours[:, 9] / harder[:, 9], 2) if harder.size else "-", _text(first, 2), f"{int((first <= 0.2).sum())} of {stages}")
             )  # fmt: skip
     shown = (f"line {line}" for line in SHOWN)
     head = ("Hz", "age", "line 10 over iterative", "at most 1", "over frozen+iterative", "line 1 over iterative",
@@ -532,6 +532,10 @@ def main() -> None:
     parser.add_argument("--measured", action="store_true", help="motions on a stack that others measured instead")
     parser.add_argument("--cases", nargs="+", choices=(*CASES, RASTER), default=tuple(CASES),
                         help="what happens, or rasters (all but rasters)")  # fmt: skip
+    parser.add_argument(
+        "--ages", nargs="+", type=int, choices=AGES, default=AGES, help="of the readings, rasters (all)"
+    )
+    parser.add_argument("--ways", nargs="+", choices=RASTER_WAYS, default=RASTER_WAYS, help="of rasters (all)")
     parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
     parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
     parser.add_argument("--picture", type=Path, help="with --table: draw the errors of the lines of rasters")
@@ -545,7 +549,7 @@ def main() -> None:
             begin = time.process_time()
             course = Course.measured(seed) if args.measured else Course.of(seed)
             new = run_stage(course, [case for case in args.cases if case != RASTER])
-            new += run_rasters(course) if RASTER in args.cases else []
+            new += run_rasters(course, args.ages, args.ways) if RASTER in args.cases else []
             records += new
             failed = sum("failed" in record for record in new)
             print(f"stage {seed}: {time.process_time() - begin:.0f} s, {failed} failed", file=sys.stderr, flush=True)
