@@ -442,9 +442,10 @@ def raster_table(records: Sequence[Record]) -> str:
         ours, rival, harder = (found[way] for way in ("repetition", "iterative", "frozen+iterative"))
         if ours.size and rival.size:
             first, tenth = ours[:, 0] / rival[:, 0], ours[:, 9] / rival[:, 9]
+            over_frozen = _text(ours[:, 9] / harder[:, 9], 2) if harder.size else "-"
             goals.append(
                 (f"{frequency_Hz:g}", str(age), _text(tenth, 2), f"{int((tenth <= 1.0).sum())} of {stages}",
-                 _text(ours[:, 9] / harder[:, 9], 2) if harder.size else "-", _text(first, 2), f"{int((first <= 0.2).sum())} of {stages}")
+                 over_frozen, _text(first, 2), f"{int((first <= 0.2).sum())} of {stages}")
             )  # fmt: skip
     shown = (f"line {line}" for line in SHOWN)
     head = ("Hz", "age", "line 10 over iterative", "at most 1", "over frozen+iterative", "line 1 over iterative",
