@@ -1,10 +1,13 @@
-"""What the guarded correction comes to on stages of others, beside its rivals, all in one run and side by side.
+"""What the guarded corrections come to on stages of others, beside their rivals, all in one run and side by side.
 
 ``python -m benchmarks.correction --first 1 --stages 2 [--json out/correction.jsonl]``. Each stage
 (``tests/foreign/plants.py``) is identified; then the same motion, which does not repeat, is followed by five
 controllers at each age of the readings, and something happens. ``--table FILE`` prints the tables of finished runs.
 Errors are mean absolute errors of the true position in percent of the commanded range. The age counts for the
 correction and for the learner alike: age 1 is the reading of the sample before.
+
+``--cases raster`` follows triangles of 5, 15 and 30 Hz, 20 lines each, from a rest, with readings of each age; errors
+are means of a line. ``--picture FILE`` draws those of the runs in ``--table``.
 """
 
 from __future__ import annotations
@@ -22,8 +25,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.signal import butter, filtfilt
 
-from adaptive.correction import Correction
+from adaptive.correction.integral import Correction, sensitivity
 from adaptive.identification import identify_lssvm
 from adaptive.types import FloatArray
 from baselines.prandtl_ishlinskii.identify import identify_mpi
@@ -36,14 +40,15 @@ from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
 from lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
 from lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
 from service.answers.guard import Limits
-from service.client.correcting import Correcting
+from service.client.correcting import Answer, Correcting
 from service.client.follower import Follower
-from service.config.correction import CorrectionConfig
+from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.config.settings import LEARN, AxisConfig
 from service.protocol.model import ModelMessage, encode_model
 from service.protocol.samples import SampleBatch
 from service.reports.tables import markdown
 from service.server.axis_loading import load_axis
+from tests.foreign.motions import BEGIN_S, motion
 from tests.foreign.plants import random_plant
 
 Record = dict[str, Any]
@@ -61,6 +66,14 @@ CASES: Final = {
     "sensor_gain": (("alone", "corrected"), (5,)),
     "drift": (("alone", "corrected"), (5,)),
 }  # fmt: skip
+#: Rasters: case, lines that are followed, and lines that are shown; controllers. "iterative" begins with the mean slope
+#: of the stage, "frozen+iterative" with the identified model.
+RASTER: Final = "raster"
+RASTERS_HZ: Final = (5.0, 15.0, 30.0)
+LINES, SHOWN = 20, (1, 5, 10, 20)
+RASTER_WAYS: Final = ("repetition", "iterative", "frozen+iterative", "alone", "corrected", "frozen+I", "I")
+#: The iterative control: share of the error that a line corrects, and its cut-off as a share of ``mode_Hz``.
+ITERATIVE: Final = (0.5, 0.7)
 #: Length of a run, when its event happens, and when its errors begin to count, s.
 SECONDS: Final = 6.0
 EVENT_S: Final = 4.0
@@ -89,10 +102,10 @@ class Unbounded(Correcting):
         super().__init__(replace(config, share=1.0), limits, dt_s)
 
     def voltage(
-        self, first: int, model: Any, points: Any, memory: FloatArray, std_V: float, trouble: str = ""
-    ) -> float:
+        self, first: int, model: Any, points: Any, memory: FloatArray, answer: Answer, trouble: str = ""
+    ) -> FloatArray:
         """As of a model of unknown error, whatever the service says."""
-        return super().voltage(first, model, points, memory, math.inf)
+        return super().voltage(first, model, points, memory, (answer[0], math.inf))
 
 
 class FittedStack:
@@ -131,6 +144,7 @@ class Course:
     known: IdentifiedPlant
     wanted: Motion
     range_um: float
+    raster_Hz: float = math.nan
 
     @classmethod
     def of(cls, seed: int) -> Course:
@@ -182,12 +196,24 @@ class Course:
         speed = np.gradient(moved, dt_s)
         return replace(self, wanted=Motion(moved, speed, np.gradient(speed, dt_s)))
 
+    def raster(self, frequency_Hz: float) -> Course:
+        """A triangle of so many hertz on the same stage, after a rest and a slow move to its lower turn."""
+        known = self.known
+        span, until_s = known.high_um - known.low_um, BEGIN_S + LINES / frequency_Hz
+        wish = ReferenceRequest(
+            known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, until_s, self.seed
+        )  # fmt: skip
+        t_s = np.arange(math.ceil(until_s / known.dt_s)) * known.dt_s
+        wanted = motion(f"raster:{frequency_Hz}")(wish)(t_s)
+        range_um = float(np.ptp(wanted.y_um[t_s >= BEGIN_S]))
+        return replace(self, wanted=wanted, range_um=range_um, raster_Hz=frequency_Hz)
+
     def event(self, name: str) -> Event:
         """What happens in the case ``name``."""
         rng = np.random.default_rng([self.seed, 51])
         sign = float(rng.choice([-1.0, 1.0]))
         size = {"gain": STEP * sign, "payload": float(rng.uniform(1.0, 2.0)), "sensor_gain": 1.0 + 0.6 * sign}
-        kind = "none" if name in ("rest", "drift") else name
+        kind = "none" if name in ("rest", "drift", RASTER) else name
         over_s = SECONDS - EVENT_S if name in ("stuck", "sensor_gain") else 0.0
         return Event(name, kind, EVENT_S, size.get(name, 0.0), over_s, self.seed)
 
@@ -208,6 +234,46 @@ class _Integral:
         u_V = min(max(self._low_V + self._integral.u_V, self._limits.u_min_V), self._limits.u_max_V)
         self._integral.u_V = u_V - self._low_V
         return u_V
+
+
+class _Iterative:
+    """The rival of the repetition: an iterative learning control, u <- Q (u + gain slope e), line by line.
+
+    Q is a Butterworth low-pass, forth and back; e leads by the identified lag.
+    """
+
+    def __init__(self, course: Course, config: CorrectionConfig) -> None:
+        known, self._gain = course.known, ITERATIVE[0]
+        model = known.models[LEARN]
+        lag_s = sensitivity(model, known.rest_um, model.rest_memory(known.rest_um), known.high_um - known.low_um)[1]
+        self._slope = 1.0 / float(np.polyfit(known.u_V, known.y_um, 1)[0])
+        self._rise = self._slope * (course.wanted.y_um - course.wanted.y_um[0]) + course.low_V
+        self._filter = butter(2, min(2.0 * ITERATIVE[1] * config.mode_Hz * known.dt_s, 0.9))
+        self._period, self._begin = 1.0 / course.raster_Hz / known.dt_s, BEGIN_S / known.dt_s
+        self._lead, self._table = lag_s / known.dt_s, np.empty(0)
+        self._pass: list[tuple[float, float, float]] = []
+
+    def read(self, seen: int, u_V: float, error_um: float) -> None:
+        """Take the error, µm, of a sample that got ``u_V``; learns once a line is complete."""
+        if seen < self._begin:
+            return
+        place = (seen - self._begin) % self._period
+        if self._pass and place < self._pass[-1][0]:
+            at, u, e = np.array(self._pass).T
+            self._places = np.arange(math.ceil(self._period)) * self._period / math.ceil(self._period)
+            if not self._table.size:
+                self._table = np.interp(self._places, at, u, period=self._period)
+            e = np.interp(self._places + self._lead, at, e, period=self._period)
+            table = np.tile(self._table + self._gain * self._slope * e, 3)
+            self._table = filtfilt(*self._filter, table)[self._places.size : 2 * self._places.size]
+            self._pass.clear()
+        self._pass.append((place, u_V, error_um))
+
+    def voltage(self, k: int, first_V: float | None = None) -> float:
+        """The voltage, V, of a sample; until a line has been learnt ``first_V``, or by the mean slope."""
+        if self._table.size:
+            return float(np.interp((k - self._begin) % self._period, self._places, self._table, period=self._period))
+        return float(self._rise[k]) if first_V is None else first_V
 
 
 def follow(course: Course, way: str, age: int, case: str) -> Record:
@@ -236,11 +302,14 @@ def follow(course: Course, way: str, age: int, case: str) -> Record:
 
     made = {"corrected": Correcting, "frozen+I": Unbounded}
     correcting = made[way](config, limits, dt_s) if way in made else None
+    if way == "repetition":
+        correcting = Correcting(config, limits, dt_s, RepetitionConfig(on=True, mode_Hz=course.mode_Hz))
     begun = newest()
     payload = encode_model(LEARN, begun.model, begun.snapshot_seq, begun.memory, begun.safety)
     follower = Follower(None, None, LEARN, lambda: payload, limits, correcting=correcting)  # type: ignore[arg-type]
     integral = _Integral(course, config, age) if way == "I" else None
-    learns = way in ("alone", "corrected")
+    iterative = _Iterative(course, config) if "iterative" in way else None
+    learns = way in ("alone", "corrected", "repetition")
     true_um, read_um, u_V, added_V = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     y, v, a = (column.tolist() for column in wanted)
     every, served = round(RESYNCHRONISE_S / dt_s), axis.newest
@@ -255,20 +324,28 @@ def follow(course: Course, way: str, age: int, case: str) -> Record:
             if k % every == every - 1:
                 part = np.arange(max(follower.snapshot_seq - 1 - first, 0), seen + 1)
                 follower.resynchronise(first + part, u_V[part], read_um[part])
-        if integral is not None:
+        if iterative is not None and seen >= 0:
+            iterative.read(seen, u_V.item(seen), y[seen] - read_um.item(seen))
+        if way == "iterative" and iterative is not None:
+            u_V[k] = min(max(iterative.voltage(k), limits.u_min_V), limits.u_max_V)
+        elif integral is not None:
             u_V[k] = integral.voltage(y[seen] - read_um.item(seen)) if seen >= 0 else low_V
         else:
             if seen >= 0:
                 follower.read(first + seen, read_um[seen])
             u_V[k] = follower.point(y[k], v[k], a[k], seq=first + k)
-        added_V[k] = 0.0 if correcting is None else correcting.correction.u_V
+            if iterative is not None:
+                u_V[k] = min(max(iterative.voltage(k, u_V.item(k)), limits.u_min_V), limits.u_max_V)
+        added_V[k] = 0.0 if correcting is None or correcting.correction is None else correcting.correction.u_V
         true, read = plant.run(k, u_V[k : k + 1])
         true_um[k] = true[0]
         read_um[k] = sensor.read(k, read)[0] + drift_um[k]
-    counts = {} if correcting is None else {
-        "halved": correcting.correction.halved, "doubted": correcting.correction.doubted,
-        "gain_per_s": correcting.correction.loop.gain_per_s,
+    integrals = correcting.correction if correcting is not None else None
+    counts: Record = {} if integrals is None else {
+        "halved": integrals.halved, "doubted": integrals.doubted, "gain_per_s": integrals.loop.gain_per_s,
     }  # fmt: skip
+    if correcting is not None and correcting.repetition is not None:
+        counts |= {"repetition_halved": correcting.repetition.halved, "period": correcting.repetition.period}
     return {"true_um": true_um, "added_V": added_V, "trouble": axis.newest.trouble, **counts}
 
 
@@ -287,6 +364,31 @@ def figures(course: Course, got: Record) -> Record:
         "carried": float(added[begin:at].mean()), "carried_after": float(added[at + second :].mean()),
         **{key: got[key] for key in ("halved", "doubted", "gain_per_s", "trouble") if key in got},
     }  # fmt: skip
+
+
+def lines(course: Course, got: Record) -> Record:
+    """Mean error of each line in percent of the range, as JSON values."""
+    error = 100.0 / course.range_um * np.abs(course.wanted.y_um - got["true_um"])
+    line = np.floor((np.arange(error.size) * course.known.dt_s - BEGIN_S) * course.raster_Hz + 1e-9)
+    counts = {key: got[key] for key in ("halved", "repetition_halved", "period", "trouble") if key in got}
+    return {"lines": [float(error[line == k].mean()) for k in range(LINES)], **counts}
+
+
+def run_rasters(course: Course, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:
+    """All runs of a stage along rasters; a run that raises has its traceback."""
+    records = []
+    for frequency_Hz, age, way in itertools.product(RASTERS_HZ, ages, ways):
+        there = course.raster(frequency_Hz)
+        record: Record = {
+            "seed": course.seed, "case": RASTER, "way": way, "age": age, "frequency_Hz": frequency_Hz,
+            "hysteresis": course.name, "dt_s": course.known.dt_s, "mode_Hz": course.mode_Hz,
+        }  # fmt: skip
+        try:
+            record |= lines(there, follow(there, way, age, RASTER))
+        except Exception:
+            record["failed"] = traceback.format_exc()
+        records.append(record)
+    return records
 
 
 def run_stage(course: Course, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
@@ -323,9 +425,61 @@ def _text(values: FloatArray, digits: int = 3) -> str:
     return f"{np.median(values):.{digits}f} / {values.max():.{digits}f}" if values.size else "-"
 
 
+def raster_table(records: Sequence[Record]) -> str:
+    """Markdown: errors of the lines `SHOWN` by frequency, age and controller, and what the goals ask of them."""
+    stages = len({record["seed"] for record in records})
+    rows, goals = [], []
+    for frequency_Hz, age in itertools.product(RASTERS_HZ, AGES):
+        found = {
+            way: np.array([r["lines"] for r in sorted(records, key=lambda r: int(r["seed"]))
+                           if (r["frequency_Hz"], r["age"], r["way"]) == (frequency_Hz, age, way)])
+            for way in RASTER_WAYS
+        }  # fmt: skip
+        for way, errors in found.items():
+            if errors.size:
+                cells = (_text(errors[:, line - 1]) for line in SHOWN)
+                rows.append((f"{frequency_Hz:g}", str(age), way, *cells))
+        ours, rival, harder = (found[way] for way in ("repetition", "iterative", "frozen+iterative"))
+        if ours.size and rival.size:
+            first, tenth = ours[:, 0] / rival[:, 0], ours[:, 9] / rival[:, 9]
+            over_frozen = _text(ours[:, 9] / harder[:, 9], 2) if harder.size else "-"
+            goals.append(
+                (f"{frequency_Hz:g}", str(age), _text(tenth, 2), f"{int((tenth <= 1.0).sum())} of {stages}",
+                 over_frozen, _text(first, 2), f"{int((first <= 0.2).sum())} of {stages}")
+            )  # fmt: skip
+    shown = (f"line {line}" for line in SHOWN)
+    head = ("Hz", "age", "line 10 over iterative", "at most 1", "over frozen+iterative", "line 1 over iterative",
+            "at most 0.2")  # fmt: skip
+    return "\n\n".join(
+        (f"Rasters on {stages} stages, median / worst, % of the range:", markdown(("Hz", "age", "way", *shown), rows),
+         "Repetition over its rivals, median / worst:", markdown(head, goals))
+    )  # fmt: skip
+
+
+def picture(records: Sequence[Record], file: Path) -> None:
+    """Draw the medians of the error of each line, readings one sample old."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(RASTERS_HZ), figsize=(11, 3.6), sharey=True, layout="constrained")
+    for panel, frequency_Hz in zip(axes, RASTERS_HZ, strict=True):
+        for way in RASTER_WAYS:
+            of = [r["lines"] for r in records if (r["frequency_Hz"], r["age"], r["way"]) == (frequency_Hz, 1, way)]
+            if of:
+                panel.semilogy(np.arange(1, LINES + 1), np.median(of, axis=0), label=way)
+        panel.set(title=f"{frequency_Hz:g} lines/s", xlabel="line", xticks=SHOWN)
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel("mean error, % of the range")
+    axes[-1].legend(fontsize=8)
+    figure.savefig(file)
+
+
 def tables(records: Sequence[Record]) -> str:
     """Markdown: errors by controller and age, and what happens."""
     records = [record for record in records if "failed" not in record]
+    rasters = [record for record in records if record["case"] == RASTER]
+    if rasters:
+        records = [record for record in records if record["case"] != RASTER]
+        return raster_table(rasters) + (f"\n\n{tables(records)}" if records else "")
     stages = len({record["seed"] for record in records})
     rows = [
         (
@@ -377,9 +531,15 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="first seed (%(default)s)")
     parser.add_argument("--stages", type=int, default=2, help="number of stages (%(default)s)")
     parser.add_argument("--measured", action="store_true", help="motions on a stack that others measured instead")
-    parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="what happens (all)")
+    parser.add_argument("--cases", nargs="+", choices=(*CASES, RASTER), default=tuple(CASES),
+                        help="what happens, or rasters (all but rasters)")  # fmt: skip
+    parser.add_argument(
+        "--ages", nargs="+", type=int, choices=AGES, default=AGES, help="of the readings, rasters (all)"
+    )
+    parser.add_argument("--ways", nargs="+", choices=RASTER_WAYS, default=RASTER_WAYS, help="of rasters (all)")
     parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
     parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
+    parser.add_argument("--picture", type=Path, help="with --table: draw the errors of the lines of rasters")
     args = parser.parse_args()
     records: list[Record] = []
     if args.table is not None:
@@ -388,7 +548,9 @@ def main() -> None:
         seeds = (seed for seed in itertools.count(args.first) if random_plant(seed).traits.dt_s > FASTEST_S)
         for seed in itertools.islice(seeds, args.stages):
             begin = time.process_time()
-            new = run_stage(Course.measured(seed) if args.measured else Course.of(seed), args.cases)
+            course = Course.measured(seed) if args.measured else Course.of(seed)
+            new = run_stage(course, [case for case in args.cases if case != RASTER])
+            new += run_rasters(course, args.ages, args.ways) if RASTER in args.cases else []
             records += new
             failed = sum("failed" in record for record in new)
             print(f"stage {seed}: {time.process_time() - begin:.0f} s, {failed} failed", file=sys.stderr, flush=True)
@@ -396,6 +558,8 @@ def main() -> None:
                 with args.json.open("a", encoding="utf-8") as out:
                     out.writelines(json.dumps(record) + "\n" for record in new)
     print(tables(records))
+    if args.picture is not None:
+        picture([r for r in records if r["case"] == RASTER and "failed" not in r], args.picture)
 
 
 if __name__ == "__main__":

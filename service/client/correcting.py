@@ -1,4 +1,4 @@
-"""The correction of a follower: pairs the readings with what was asked for, by the numbers of their samples."""
+"""The corrections of a follower: pair the readings with what was asked for, by the numbers of their samples."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import logging
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.correction import Correction, sensitivity
+from adaptive.correction.integral import Correction, sensitivity
+from adaptive.correction.repetition import Repetition
 from adaptive.types import FloatArray, InverseModel
 from service.answers.guard import Limits
-from service.config.correction import CorrectionConfig
+from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.config.schema import build_settings, keys_of
 from service.protocol.errors import FieldError
 from service.protocol.samples import column, sequence
@@ -22,6 +23,9 @@ from service.protocol.samples import column, sequence
 _LOGGER: Final = logging.getLogger("dehyst.client")
 #: Displacement, µm, velocity, µm/s, and acceleration, µm/s², (n,) each.
 Motion = tuple[FloatArray, FloatArray, FloatArray]
+_Config = TypeVar("_Config", CorrectionConfig, RepetitionConfig)
+#: (n,) voltages, V, and the standard deviation of the first one, V.
+Answer = tuple[FloatArray, float]
 
 #: Points that are kept for readings to come; older readings are left out.
 _KEPT: Final = 4096
@@ -37,20 +41,28 @@ class Correcting:
 
     Attributes
     ----------
-    on : False lets the correction go, over ``fade_s``. trouble : for which it is let go now, "" for none.
-    correction : the integral and its state.
+    on : False lets the corrections go, over ``fade_s``. trouble : for which they are let go now, "" for none.
+    correction : the integral and its state; None where the axis has none. repetition : the correction of motion that
+    repeats; None where the axis has none. While it is active the integral stays as it is.
     age : samples from a reading to the last voltage that it changes; the largest of late.
     """
 
-    def __init__(self, config: CorrectionConfig, limits: Limits, dt_s: float) -> None:
+    def __init__(
+        self, config: CorrectionConfig, limits: Limits, dt_s: float, repetition: RepetitionConfig | None = None
+    ) -> None:
         self._range_um = limits.y_max_um - limits.y_min_um
         if not math.isfinite(self._range_um):
             raise FieldError("limits.y_min_um, y_max_um", "none", "the displacement range of the axis")
         self.on = True
         self.trouble = ""
-        self.correction = Correction(dt_s, config.mode_Hz, config.fade_s)
+        self.correction = Correction(dt_s, config.mode_Hz, config.fade_s) if config.on else None
+        self.repetition = None
+        drive_V = limits.u_max_V - limits.u_min_V
+        self._most_V, self._most_repeated_V = config.share * drive_V, 0.0
+        if repetition is not None and repetition.on:
+            self.repetition = Repetition(dt_s, repetition.mode_Hz, repetition.fade_s)
+            self._most_repeated_V = repetition.share * drive_V
         self.age = 0
-        self._most_V = config.share * (limits.u_max_V - limits.u_min_V)
         self._dt_s, self._slope_every = dt_s, math.ceil(_SLOPE_S / dt_s)
         self._wanted_um = np.full(_KEPT, math.nan)
         self._numbers = np.full(_KEPT, -1, dtype=np.int64)
@@ -63,12 +75,11 @@ class Correcting:
     @classmethod
     def of_status(cls, status: Mapping[str, Any], limits: Limits, dt_s: float) -> Correcting | None:
         """As the status of an axis says; None where it has no correction. Raises FieldError on impossible settings."""
-        said = status.get("correction")
-        if not said:
+        correction = _said(CorrectionConfig, status, "correction")
+        repetition = _said(RepetitionConfig, status, "repetition")
+        if correction is None and repetition is None:
             return None
-        known = {key.name for key in keys_of(CorrectionConfig)}  # a newer service may say more
-        table = {name: value for name, value in dict(said).items() if name in known}
-        return cls(build_settings(CorrectionConfig, table, "status.correction"), limits, dt_s)
+        return cls(correction or CorrectionConfig(), limits, dt_s, repetition)
 
     def read(self, seq: ArrayLike, y_um: ArrayLike) -> None:
         """Take the (n,) readings ``y_um``, µm, of the samples ``seq``, rising; those that were taken are left out.
@@ -86,50 +97,84 @@ class Correcting:
             self._read = self._readings[-1][0]
 
     def voltage(
-        self, first: int, model: InverseModel, points: Motion, memory: FloatArray, std_V: float, trouble: str = ""
-    ) -> float:
-        """The correction, V, of the voltages for (n,) ``points`` from sample ``first`` on.
+        self, first: int, model: InverseModel, points: Motion, memory: FloatArray, answer: Answer, trouble: str = ""
+    ) -> FloatArray:
+        """(n,) corrections, V, of the voltages for (n,) ``points`` from sample ``first`` on.
 
-        memory : (m,) of ``model`` before the first one. std_V : standard deviation of the model's answer to it, V; NaN
-        where it states none: then nothing is corrected. trouble : what the service has named, "" for nothing.
+        memory : (m,) of ``model`` before the first one. answer : (n,) voltages that the model gives, V, and standard
+        deviation of the first one, V; NaN where it states none: then nothing is corrected but motion that repeats.
+        trouble : what the service has named, "" for nothing.
         """
-        correction, n, self.trouble = self.correction, points[0].size, trouble
+        n, self.trouble = points[0].size, trouble
         numbers = np.arange(first, first + n)[-_KEPT:]
         self._numbers[numbers % _KEPT] = numbers
         self._wanted_um[numbers % _KEPT] = points[0][-_KEPT:]
-        last, point = first + n - 1, (points[0][:1], points[1][:1], points[2][:1])
+        point = points[0][:1], points[1][:1], points[2][:1]
         before, self._model = self._model, model
-        if before is not None and before is not model and correction.u_V and before.memory_size == memory.size:
+        if before is not None and before is not model and self._integral_V and before.memory_size == memory.size:
             changed_V = model.feedforward(*point, memory).u_V.item(0) - before.feedforward(*point, memory).u_V.item(0)
-            if math.isfinite(changed_V):
-                correction.hand_over(changed_V)
+            if math.isfinite(changed_V) and self.correction is not None:
+                self.correction.hand_over(changed_V)
+        u_V, std_V = answer
         if self.trouble or not self.on:
             self._readings.clear()
-            correction.release()
-            return correction.u_V
-        if not self._readings:
-            correction.wait()
-            return correction.u_V
-        self._look_at_age(last - self._readings[0][0])
-        if self._slope_held == 0:
-            self._local = sensitivity(model, point[0].item(0), memory, self._range_um)
-        self._slope_held = (self._slope_held + 1) % self._slope_every
-        correction.set(self.age, *self._local, self._bound_V(std_V))
-        halved = correction.halved
+            for each in (self.correction, self.repetition):
+                if each is not None:
+                    each.release()
+            return np.full(n, self._integral_V + (0.0 if self.repetition is None else self.repetition.u_V))
+        if self._readings:
+            self._look_at_age(first + n - 1 - self._readings[0][0])
+            if self._slope_held == 0:
+                self._local = sensitivity(model, point[0].item(0), memory, self._range_um)
+            self._slope_held = (self._slope_held + 1) % self._slope_every
+            self._take(first + n - 1, std_V)
+        elif self.correction is not None:
+            self.correction.wait()
+        added_V = np.full(n, self._integral_V)
+        if self.repetition is not None:
+            added_V += [self.repetition.add(first + k, points[0].item(k), u_V.item(k)) for k in range(n)]
+        return added_V
+
+    def _take(self, last: int, std_V: float) -> None:
+        """Use the readings that have come; ``last`` : sample of the last voltage that they can change."""
+        correction, repetition = self.correction, self.repetition
+        if correction is not None:
+            correction.set(self.age, *self._local, self._bound_V(std_V))
+        if repetition is not None:
+            repetition.set(self.age, *self._local, self._most_repeated_V)
+        halved = self._halved
         for seq, read_um in self._readings:
             wanted_um = self._asked(seq)
-            correction.take(wanted_um - read_um, (wanted_um - self._asked(seq - 1)) / self._dt_s)
+            if repetition is not None:
+                repetition.read(seq, wanted_um - read_um)
+            if correction is not None and not (repetition is not None and repetition.active):
+                correction.take(wanted_um - read_um, (wanted_um - self._asked(seq - 1)) / self._dt_s)
         self._readings.clear()
-        if correction.halved > halved:
-            _LOGGER.warning(
-                "the correction oscillated up to sample %d: its gain is now %g of the design; is correction.mode_Hz "
-                "above the stage's first mode?", last, correction.factor,
-            )  # fmt: skip
-        return correction.u_V
+        for name, before, each in zip(("correction", "repetition"), halved, (correction, repetition), strict=True):
+            if each is not None and each.halved > before:
+                _LOGGER.warning(
+                    "the %s grew up to sample %d: its gain is now %g of the design; is %s.mode_Hz above the stage's "
+                    "first mode?", name, last, each.factor, name,
+                )  # fmt: skip
+
+    def applied(self, first: int, u_V: FloatArray) -> None:
+        """Take the (n,) voltages, V, that the points from sample ``first`` on got in the end."""
+        if self.repetition is not None:
+            for k, value in enumerate((u_V - self._integral_V).tolist()):
+                self.repetition.applied(first + k, value)
+
+    @property
+    def _integral_V(self) -> float:
+        return 0.0 if self.correction is None else self.correction.u_V
+
+    @property
+    def _halved(self) -> tuple[int, int]:
+        correction, repetition = self.correction, self.repetition
+        return 0 if correction is None else correction.halved, 0 if repetition is None else repetition.halved
 
     def begin(self, u_V: float, std_V: float) -> None:
         """Begin with the correction ``u_V``, V, as far as it is within its bound: a stage that is driven already."""
-        if math.isfinite(u_V):
+        if math.isfinite(u_V) and self.correction is not None:
             self.correction.begin(u_V, self._bound_V(std_V))
 
     def _bound_V(self, std_V: float) -> float:
@@ -149,3 +194,13 @@ class Correcting:
         self._age_held += 1
         if age >= self.age or self._age_held >= _AGE_KEPT:
             self.age, self._age_held = max(age, 0), 0
+
+
+def _said(kind: type[_Config], status: Mapping[str, Any], name: str) -> _Config | None:
+    """Settings as a status says them; None where it says none. Raises FieldError on impossible ones."""
+    said = status.get(name)
+    if not said:
+        return None
+    known = {key.name for key in keys_of(kind)}  # a newer service may say more
+    table = {key: value for key, value in dict(said).items() if key in known}
+    return build_settings(kind, table, f"status.{name}")

@@ -27,7 +27,7 @@ from service.answers.answering import begin_from, derivatives
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from service.answers.guard import Limits, check_domain, guard, limit_voltage
 from service.answers.which_model import Answering, answering, seen_in, trust_by_age
-from service.client.correcting import Correcting, Motion
+from service.client.correcting import Answer, Correcting, Motion
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
@@ -401,18 +401,19 @@ class Follower:
         trust, stale = self._standing()
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely(_arrays(motion)).u_V[0])
-        if self.correcting is not None and self._number >= 0:
-            u += self._corrected(model, _arrays(motion), std)
-        self.memory = after
         if self._fade_V:
             u += self._faded(1).item()
+        corrects = self.correcting is not None and self._number >= 0
+        if corrects:
+            u += self._corrected(model, _arrays(motion), (np.array([u]), std)).item()
+        self.memory = after
         step_V = limits.slew_V_per_s * model.dt_s
         u, flags = limit_voltage(u, self._u_before_V, limits.u_min_V, limits.u_max_V, step_V)
         flags |= (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
         self._u_before_V, self._answered, self._stand_in = u, model, ""
         self.last_flags, self.last_std_V = flags, std
-        if flags and self.correcting is not None:
-            self.correcting.leave_out(self._number, np.array([flags]))
+        if corrects:
+            self._applied(np.array([u]), np.array([flags]))
         self._number += self._number >= 0
         return u
 
@@ -481,11 +482,18 @@ class Follower:
             raise FieldError("memory", f"{own.size} values", f"{m} for model {self.name!r}")
         return own.copy()
 
-    def _corrected(self, model: InverseModel, points: Motion, std_V: float) -> float:
-        """What is added to the voltages for (n,) ``points``, V."""
+    def _corrected(self, model: InverseModel, points: Motion, answer: Answer) -> FloatArray:
+        """(n,) what is added to the voltages for (n,) ``points``, V."""
         assert self.correcting is not None
         trouble = self._newest[0].safety.trouble or ("stale" if self.stale else "")
-        return self.correcting.voltage(self._number, model, points, self.memory, std_V, trouble)
+        return self.correcting.voltage(self._number, model, points, self.memory, answer, trouble)
+
+    def _applied(self, u_V: FloatArray, flags: NDArray[Any]) -> None:
+        """Tell the correction the (n,) voltages, V, that came of it, and their flags."""
+        assert self.correcting is not None
+        self.correcting.applied(self._number, u_V)
+        if flags.any():
+            self.correcting.leave_out(self._number, flags)
 
     def _faded(self, n: int) -> FloatArray:
         """(n,) what is still added to the next n voltages after a resynchronisation, V."""
@@ -538,14 +546,15 @@ class Follower:
         got = answer_safely(message.model, self.memory, points, self._u_before_V, rules, safety.stand_in, safety.blends)
         n = got.u_V.size
         added_V = self._faded(n) if self._fade_V else np.zeros(n)
-        if self.correcting is not None and self._number >= 0:
-            added_V += self._corrected(message.model, points, float(got.std_V[0]))
+        corrects = self.correcting is not None and self._number >= 0
+        if corrects:
+            added_V += self._corrected(message.model, points, (got.u_V + added_V, float(got.std_V[0])))
         if added_V.any():
             inside = (got.flags & OUTSIDE_DOMAIN) == 0
             u_V, flags = guard(got.u_V + added_V, inside, message.model.dt_s, self.limits, self._u_before_V)
             got = got._replace(u_V=u_V, flags=got.flags | flags)
-        if self.correcting is not None:
-            self.correcting.leave_out(self._number, got.flags)
+        if corrects:
+            self._applied(got.u_V, got.flags)
         self._number += n * (self._number >= 0)
         self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
         self._answered, self._stand_in = message.model, got.stand_in

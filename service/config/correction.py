@@ -1,4 +1,4 @@
-"""Settings of the correction on top of the feedforward: an ``[axis.correction]`` table."""
+"""Settings of the corrections on top of the feedforward: tables ``[axis.correction]`` and ``[axis.repetition]``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from service.config.schema import Setting
+
+_MODE = Setting(
+    help="lowest frequency at which the stage rings ('dehyst modes'), with the heaviest payload",
+    unit="Hz",
+    low=1,
+    high=100_000,
+)
+_FADE = Setting(help="time over which a correction without good readings is let go", unit="s", low=0.01, high=60)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,15 +26,25 @@ class CorrectionConfig:
     share: Annotated[
         float, Setting(help="largest correction as a share of the voltage range", low=0, above=True, high=1)
     ] = 0.02
-    mode_Hz: Annotated[
+    mode_Hz: Annotated[float, _MODE] = 100.0
+    fade_s: Annotated[float, _FADE] = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RepetitionConfig:
+    """When a follower corrects motion that repeats by the pass before, see docs/correction.md."""
+
+    on: Annotated[
+        bool, Setting(help="true: followers correct motion that repeats by the readings of the pass before")
+    ] = False
+    share: Annotated[
         float,
         Setting(
-            help="lowest frequency at which the stage rings ('dehyst modes'), with the heaviest payload",
-            unit="Hz",
-            low=1,
-            high=100_000,
+            help="largest correction, and largest residual that is no doubt, as a share of the voltage range",
+            low=0,
+            above=True,
+            high=1,
         ),
-    ] = 100.0
-    fade_s: Annotated[
-        float, Setting(help="time over which a correction without good readings is let go", unit="s", low=0.01, high=60)
-    ] = 0.5
+    ] = 0.1
+    mode_Hz: Annotated[float, _MODE] = 100.0
+    fade_s: Annotated[float, _FADE] = 0.5

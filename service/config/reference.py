@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from baselines.competition.config import CompetitionConfig
 from service.background.settings import RetuningConfig, WatchConfig
-from service.config.correction import CorrectionConfig
+from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.config.schema import Key, inline_keys, keys_of
 from service.config.settings import AxisConfig, ServeConfig
 from service.fleet.settings import FleetSettings
@@ -24,7 +24,7 @@ from service.fleet.settings import FleetSettings
 _HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
 _WIDTH = 36
 #: Nested dataclasses that have a table of their own on the page.
-_OWN_TABLES = (CompetitionConfig, CorrectionConfig, RetuningConfig, WatchConfig)
+_OWN_TABLES = (CompetitionConfig, CorrectionConfig, RepetitionConfig, RetuningConfig, WatchConfig)
 _TITLE = """\
 # Configuration of `dehyst serve`
 
@@ -54,6 +54,7 @@ def tables() -> tuple[tuple[str, type], ...]:
         ("`[axis.competition]`: comparison and exchange of models", CompetitionConfig),
         ("`[axis.retuning]`: background tuning of hyper-parameters", RetuningConfig),
         ("`[axis.correction]`: correction by fresh readings", CorrectionConfig),
+        ("`[axis.repetition]`: correction of motion that repeats", RepetitionConfig),
         ("`[axis.diagnosis]`: background diagnosis", WatchConfig),
         ("`[fleet]`: many axes as one batch", FleetSettings),
     )

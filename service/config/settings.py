@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from baselines.competition.config import CompetitionConfig
 from service.answers.guard import Limits
 from service.background.settings import RetuningConfig, WatchConfig
-from service.config.correction import CorrectionConfig
+from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.config.limits import limits_setting
 from service.config.schema import Setting, build_settings, parse_toml, read_text
 from service.fleet.settings import FleetSettings
@@ -32,6 +32,7 @@ _LEARNER = Setting(help="settings of the learner, see docs/learner.md")
 _COMPETITION = Setting(help="how models are compared and exchanged, see docs/learner.md")
 _RETUNING = Setting(help="background tuning of hyper-parameters, see docs/learner.md")
 _CORRECTION = Setting(help="correction of followers by fresh readings, see docs/correction.md")
+_REPETITION = Setting(help="correction of motion that repeats, see docs/correction.md")
 _DIAGNOSIS = Setting(help="background diagnosis, see docs/diagnosis.md")
 
 
@@ -124,6 +125,7 @@ class AxisConfig:
     competition: Annotated[CompetitionConfig, _COMPETITION] = field(default_factory=CompetitionConfig)
     retuning: Annotated[RetuningConfig, _RETUNING] = field(default_factory=RetuningConfig)
     correction: Annotated[CorrectionConfig, _CORRECTION] = field(default_factory=CorrectionConfig)
+    repetition: Annotated[RepetitionConfig, _REPETITION] = field(default_factory=RepetitionConfig)
 
 
 @dataclass(frozen=True, slots=True)

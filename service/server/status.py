@@ -90,6 +90,7 @@ def axis_status(
         "snapshots_kept": axis.config.snapshots_kept,
         "delta_hz": axis.config.delta_hz,
         "correction": asdict(axis.config.correction) if axis.config.correction.on else None,
+        "repetition": asdict(axis.config.repetition) if axis.config.repetition.on else None,
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
             **counts.samples,

@@ -14,7 +14,7 @@ from service.answers.guard import Limits
 from service.client.client import Client
 from service.client.correcting import Correcting
 from service.client.follower import Follower
-from service.config.correction import CorrectionConfig
+from service.config.correction import CorrectionConfig, RepetitionConfig
 from service.protocol.delta import FollowedState
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, Safety, decode_model, encode_model
@@ -224,9 +224,110 @@ def test_a_trouble_travels_with_the_model_and_is_nothing_while_all_is_well() -> 
 def test_an_older_or_newer_service_is_understood() -> None:
     assert Correcting.of_status({}, LIMITS, DT_S) is None
     assert Correcting.of_status({"correction": None}, LIMITS, DT_S) is None
-    assert Correcting.of_status({"correction": {"on": True, "new": 1}}, LIMITS, DT_S) is not None
+    one = Correcting.of_status({"correction": {"on": True, "new": 1}}, LIMITS, DT_S)
+    assert one is not None
+    assert one.repetition is None
+    one = Correcting.of_status({"correction": None, "repetition": {"on": True, "new": 1}}, LIMITS, DT_S)
+    assert one is not None
+    assert (one.correction, one.repetition is None) == (None, False)
     with pytest.raises(FieldError, match=r"status.correction.fade_s: got '1', expected 0.01 to 60 s"):
         Correcting.of_status({"correction": {"fade_s": "1"}}, LIMITS, DT_S)
+
+
+REPEATS = RepetitionConfig(on=True, mode_Hz=200.0, fade_s=0.1)
+#: Samples of a pass, not a whole number of them.
+PERIOD = 66.6667
+
+
+def raster(n: int) -> np.ndarray:
+    return 40.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(n) / PERIOD)
+
+
+def repeating(config: CorrectionConfig | None = None) -> Follower:
+    correcting = Correcting(config or CorrectionConfig(), LIMITS, DT_S, REPEATS)
+    return Follower(None, None, "lssvm_adaptive", message, LIMITS, correcting=correcting)  # type: ignore[arg-type]
+
+
+def rasters(
+    follower: Follower, n: int, first: int = 0, read: Callable[[int, float], float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(voltages, errors) along `raster` of a stage that follows the model but for a wave of 0.2 µm."""
+    ideal = Follower(None, None, "lssvm_adaptive", message, LIMITS)  # type: ignore[arg-type]
+    y = raster(first + n)
+    wave = 0.2 * np.sin(4.0 * np.pi * np.arange(first + n) / PERIOD + 1.0)
+    slope = LIMITS.u_max_V / 110.0
+    u_V, error_um = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        seq = first + k
+        if k:
+            reading = y[seq - 1] - error_um[k - 1]
+            follower.read(seq - 1, reading if read is None else read(seq - 1, reading))
+        u_V[k] = follower.point(y[seq], seq=seq)
+        error_um[k] = -wave[seq] - (u_V[k] - ideal.point(y[seq])) / slope
+    return u_V, error_um
+
+
+@pytest.mark.parametrize("config", [None, CONFIG])
+def test_motion_that_repeats_is_corrected_by_the_pass_before(config: CorrectionConfig | None) -> None:
+    one = repeating(config)
+    _, error_um = rasters(one, 1400)
+    assert one.correcting is not None
+    repetition = one.correcting.repetition
+    assert repetition is not None
+    assert repetition.period == pytest.approx(PERIOD, abs=0.01)
+    assert repetition.active
+    assert np.abs(error_um[-70:]).mean() < 0.05 * np.abs(error_um[:70]).mean()
+    integral = one.correcting.correction
+    assert (integral is None) == (config is None)
+    if integral is not None:  # it stays as it is: the convergence is tested without it
+        held_V = integral.u_V
+        rasters(one, 100, first=1400)
+        assert integral.u_V == held_V
+
+
+def test_a_period_can_be_stated_and_blocks_of_points_are_corrected_too() -> None:
+    one, plain = repeating(), follower(None)
+    assert one.correcting is not None
+    assert one.correcting.repetition is not None
+    one.correcting.repetition.state(PERIOD * DT_S)
+    rasters(one, 1000)
+    rasters(plain, 1000)
+    y = raster(1020)[1000:]
+    zeros = np.zeros(20)
+    added_V = one.trajectory(y, zeros, zeros, seq=1000)[0] - plain.trajectory(y, zeros, zeros)[0]
+    wave_V = 0.2 * LIMITS.u_max_V / 110.0 * np.sin(4.0 * np.pi * np.arange(1000, 1020) / PERIOD + 1.0)
+    np.testing.assert_allclose(added_V, -wave_V, atol=1.5e-3)
+
+
+def test_a_named_trouble_and_off_let_the_repetition_go() -> None:
+    one = repeating()
+    rasters(one, 1000)
+    assert one.correcting is not None
+    repetition = one.correcting.repetition
+    assert repetition is not None
+    carried_V = abs(repetition.u_V)
+    one._take(decode_model(message(Safety(trouble="sensor_stuck"))))
+    added_V = rasters(one, 60, first=1000)[0] - rasters(follower(None), 1060)[0][1000:]
+    assert (repetition.active, repetition.u_V) == (False, 0.0)
+    assert np.abs(np.diff(added_V)).max() < max(carried_V, 0.02) / 2.0
+    one._take(decode_model(message(Safety())))
+    rasters(one, 400, first=1060)
+    assert repetition.active
+    one.correcting.on = False
+    rasters(one, 60, first=1460)
+    assert (repetition.active, repetition.u_V) == (False, 0.0)
+
+
+def test_new_models_do_not_move_a_motion_that_repeats() -> None:
+    """The learner goes on beside it: what it changes in its answer leaves the correction."""
+    one = repeating()
+    before_V, _ = rasters(one, 1000)
+    beta = MODEL.beta.copy()  # type: ignore[attr-defined]
+    beta[0] += 0.02
+    one._take(decode_model(message(None, replace(MODEL, beta=beta))))  # type: ignore[type-var]
+    assert one.point(raster(1001)[-1], seq=1000) == pytest.approx(
+        np.interp(1000 - PERIOD, np.arange(1000), before_V), abs=5e-3
+    )
 
 
 ON = 'served = "lssvm_adaptive"\ncompete = []\n[axis.correction]\non = true\nmode_Hz = 200.0\nfade_s = 0.2\n'
@@ -270,3 +371,41 @@ def test_a_real_service_switches_it_on_and_a_stuck_sensor_lets_it_go(client: Cli
     assert 2500 < named < 3500, client.status()["trouble"]
     assert followed.correcting.trouble == client.status()["trouble"]
     assert added_V[k] == 0.0
+
+
+REPEATING = 'served = "lssvm_adaptive"\ncompete = []\n[axis.repetition]\non = true\nmode_Hz = 200.0\n'
+
+
+@pytest.fixture
+def repeated(serve: Any) -> Iterator[Client]:
+    with Client.connect(serve(extra=REPEATING).endpoint, timeout_s=5.0, wait_s=10.0) as connected:
+        yield connected
+
+
+@pytest.mark.e2e
+def test_a_real_service_switches_the_repetition_on_while_it_learns(repeated: Client) -> None:
+    """In lock step with a stage of 11 µm/V and a wave in time, which no model of the position can know."""
+    followed = repeated.follow()
+    assert followed.correcting is not None
+    repetition = followed.correcting.repetition
+    assert repetition is not None
+    assert followed.correcting.correction is None
+    n = 2200
+    y = raster(n)
+    v = np.gradient(y, DT_S)
+    wave = 0.5 * np.sin(6.0 * np.pi * np.arange(n) / PERIOD)
+    u_V, read_um = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        if k:
+            followed.read(k - 1, read_um[k - 1])
+        u_V[k] = followed.point(y[k], v[k], seq=k)
+        read_um[k] = 11.0 * u_V[k] + 1.0 + wave[k]
+        if k % 5 == 4:
+            part = np.arange(k - 4, k + 1)
+            repeated.samples(part, part * DT_S, u_V[part], read_um[part])
+            followed.wait(k - 24, 2.0)
+    error_um = np.abs(read_um - y)
+    assert repetition.active
+    assert repetition.period == pytest.approx(PERIOD, abs=0.01)
+    assert error_um[-200:].mean() < 0.05
+    assert error_um[-200:].mean() < 0.3 * error_um[:134].mean()
