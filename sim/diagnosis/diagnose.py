@@ -20,7 +20,7 @@ from sim.diagnosis.nominal import (
 from sim.diagnosis.prepare import Prepared
 from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
 from sim.diagnosis.search.held_out import HeldOut, split
-from sim.diagnosis.search.intervals import numbers, parameter_errors
+from sim.diagnosis.search.intervals import numbers, over_ties, parameter_errors
 from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
 from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
 from sim.diagnosis.witnesses import witnesses
@@ -287,8 +287,10 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
     """The accepted causes with their numbers, and the share of the error that each removed when it was added."""
     causes = []
     errors = parameter_errors(extended, search.mask, search.parts, search.readings)
+    ties = [rival.fit for one in found for rival in one.rivals]
     for i, one in enumerate(found):
         values, spans = numbers(errors, i)
+        spans = over_ties(values, spans, one.name, ties)
         also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data), *search.shown_as_well(one.name))
         # One voltage and one sensor show the sum of these: the other one of a set is always possible.
         also = tuple(dict.fromkeys((*also, *sorted(search.catalogue.same_set({one.name}) - {one.name}))))

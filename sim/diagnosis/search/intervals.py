@@ -6,6 +6,7 @@ motion, and an error of the loop's form, which moves the numbers of the causes b
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,6 +109,28 @@ def numbers(
         values[name] = value
         spans[name] = (min(value, other) - half, max(value, other) + half)
     return values, spans
+
+
+def over_ties(
+    values: dict[str, float], spans: dict[str, tuple[float, float]], name: str, ties: Iterable[ModelFit]
+) -> dict[str, tuple[float, float]]:
+    """The intervals of a cause ``name``, wide enough for fits that explain the recording as well (``ties``).
+
+    About the number that the cause has beside another name of a second one, or that its own other name has.
+    """
+    out = dict(spans)
+    for fit in ties:
+        for i, cause in enumerate(fit.model.causes):
+            # The last cause stands in the place of another; where ``name`` is missing, in the place of this one.
+            stands_in = i + 1 == len(fit.model.causes) and all(c.name != name for c in fit.model.causes)
+            if cause.name != name and not stands_in:
+                continue
+            for number, (value, _) in cause.reported(fit.model.parameters_of(fit.p, i), fit.model.data).items():
+                if number in out:
+                    low, high = spans[number]
+                    off = value - values[number]
+                    out[number] = (min(out[number][0], low + off), max(out[number][1], high + off))
+    return out
 
 
 def across_zero(errors: ParameterErrors, index: int) -> bool:

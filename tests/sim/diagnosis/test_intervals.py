@@ -11,7 +11,14 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.intervals import WIDER, ParameterErrors, across_zero, numbers, parameter_errors
+from sim.diagnosis.search.intervals import (
+    WIDER,
+    ParameterErrors,
+    across_zero,
+    numbers,
+    over_ties,
+    parameter_errors,
+)
 from sim.diagnosis.search.search import Search, Thresholds
 from sim.effects.delay import Delay
 from sim.fitting.fit_data import FitData
@@ -152,3 +159,37 @@ class Silent(Gain):
 
 def test_a_cause_without_numbers_is_not_nothing() -> None:
     assert not across_zero(errors_of(Silent(), 0.0), 0)
+
+
+@dataclass(frozen=True)
+class Number(CauseModel):
+    """A cause with one number."""
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        return {"tau_s": (float(p[0]), np.ones(1))}
+
+
+class Tie:
+    """A fit of causes with one number each."""
+
+    def __init__(self, **of: float) -> None:
+        self.model, self.p = self, np.array(list(of.values()))
+        self.causes, self.data = tuple(Number(name=name) for name in of), None
+
+    def parameters_of(self, p: FloatArray, index: int) -> FloatArray:
+        return p[index : index + 1]
+
+
+@pytest.mark.parametrize(
+    ("tie", "span"),
+    [
+        # Another name of this cause has its own number, and this cause another one beside another name of a second.
+        (Tie(hysteresis_shape=9.0, delay=4.0), (2.0, 5.0)),
+        (Tie(sensor_lag=1.0, rate_dependence=9.0), (0.0, 4.0)),
+        (Tie(sensor_lag=3.5, rate_dependence=9.0), (2.0, 4.5)),
+        (Tie(), (2.0, 4.0)),
+    ],
+)
+def test_an_interval_holds_the_number_in_every_fit_that_does_as_well(tie: Tie, span: tuple[float, float]) -> None:
+    said = over_ties({"tau_s": 3.0}, {"tau_s": (2.0, 4.0)}, "sensor_lag", [cast(ModelFit, tie)])
+    assert said == {"tau_s": span}

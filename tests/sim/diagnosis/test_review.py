@@ -16,6 +16,7 @@ from sim.diagnosis.search.held_out import HeldOut, Split
 from sim.diagnosis.search.screening import ScreenedCause
 from sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
 from sim.diagnosis.search.stretches import sizes_by_stretch
+from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.sight import Sight
 
@@ -243,3 +244,57 @@ def test_the_other_one_of_a_set_is_no_rival_of_a_third_cause() -> None:
     of_asymmetry, of_hum = search.skipped
     assert "sensor_nonlinearity" not in of_asymmetry
     assert {"asymmetry", "sensor_nonlinearity"} <= of_hum
+
+
+@pytest.mark.parametrize(
+    ("nominal_um2", "seen", "named"), [(590.0, None, ["delay"]), (610.0, None, []), (610.0, True, ["delay"])]
+)
+def test_what_no_direct_test_sees_removes_a_tenth_of_the_nominal_error(
+    nominal_um2: float, seen: bool | None, named: list[str]
+) -> None:
+    """It removes 60 um2 of 108, the rest of which has no name. The review asks what the search asks."""
+    size = {"delay": np.ones(12), "unknown": np.full(12, 2.0)}
+    search, _ = reviewed(size, sights={"delay": Sight(seen, "")})
+    search.nominal_um2 = nominal_um2
+    fit = search.fit_of((replace(CauseModel(), name="delay", approximates=True),))
+    steps = {"delay": AcceptedCause("delay", 0.001, 0.5)}
+    _, _, found = review(search, fit, search.held(fit), steps)
+    assert [one.name for one in found] == named
+
+
+def test_what_removes_nearly_all_that_is_above_the_noise_is_named_however_little_that_is() -> None:
+    search, _ = reviewed({"delay": np.ones(12)})
+    search.nominal_um2 = 1e6
+    fit = search.fit_of((replace(CauseModel(), name="delay"),))
+    _, _, (found,) = review(search, fit, search.held(fit), {"delay": AcceptedCause("delay", 0.001, 0.9)})
+    assert found.name == "delay"
+
+
+@dataclass(frozen=True)
+class Line(CauseModel):
+    """A permanent line, with no number that matters here."""
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return (ModelParameter("amplitude_um", "um", 0.0, -1.0, 1.0, 0.1, ActsOn.READING, True),)
+
+    def line_hz(self, p: FloatArray) -> float | None:
+        return 50.0
+
+
+@pytest.mark.parametrize(("shows", "gain", "named"), [(False, 0.9, True), (False, 0.05, False), (True, 0.05, True)])
+def test_a_line_that_a_larger_error_hides_in_the_spectrum_is_named_like_any_cause(
+    shows: bool, gain: float, named: bool
+) -> None:
+    """One that the spectrum shows is named however little it removes."""
+
+    class Search50(Reviewed):
+        def is_line(self, cause: CauseModel, p: FloatArray, base: ModelFit) -> bool:
+            return shows
+
+    search = Search50(np.ones(240, dtype=np.bool_), PARTS, SIGMA_UM, Thresholds(), 0, lambda *_: None)
+    search.nominal_um2 = 120.0
+    before, after = held(np.full(12, 10.0)), held(np.full(12, 10.0 * (1.0 - gain)))
+    line = Line(name="mains_hum")
+    base, fit = (cast(ModelFit, Fit(Model(causes), np.zeros(240), before)) for causes in ((), (line,)))
+    best = CauseCandidate(line, fit, after, after.sse_um2)
+    assert search.acceptable(best, before, np.zeros(24), 0.001, base) is named
