@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CLIENT = """
 import sys, time
 begin = time.perf_counter()
-from service.client.client import Client
+from dehyst.service.client.client import Client
 imported_s = time.perf_counter() - begin
 heavy = sorted({"numba", "scipy", "pyarrow", "matplotlib", "rerun", "psutil"} & set(sys.modules))
 assert not heavy, heavy

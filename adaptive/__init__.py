@@ -3,7 +3,7 @@
 Identify the inverse of a stage, and follow the stage when its gain has dropped by 10 %:
 
 >>> import numpy as np
->>> from adaptive import IdentifyConfig, Learner, Sample, identify_lssvm
+>>> from dehyst.adaptive import IdentifyConfig, Learner, Sample, identify_lssvm
 >>> dt_s = 1e-3
 >>> t_s = np.arange(4000) * dt_s
 >>> u_V = 5.0 - 2.0 * np.cos(2.0 * np.pi * t_s) - 2.0 * np.cos(2.0 * np.pi * 2.3 * t_s)
@@ -31,23 +31,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from adaptive.errors import DehystError as DehystError
-    from adaptive.errors import InputError as InputError
-    from adaptive.errors import ModelFileError as ModelFileError
-    from adaptive.errors import NumericsError as NumericsError
-    from adaptive.features import FeatureMap as FeatureMap
-    from adaptive.identification import IdentificationReport as IdentificationReport
-    from adaptive.identification import IdentifyConfig as IdentifyConfig
-    from adaptive.identification import identify_lssvm as identify_lssvm
-    from adaptive.inverse_model import LssvmInverse as LssvmInverse
-    from adaptive.online.config import LearnerConfig as LearnerConfig
-    from adaptive.online.learner import Learner as Learner
-    from adaptive.types import Feedforward as Feedforward
-    from adaptive.types import InverseModel as InverseModel
-    from adaptive.types import OnlineModel as OnlineModel
-    from adaptive.types import Sample as Sample
+    from dehyst.adaptive.errors import DehystError as DehystError
+    from dehyst.adaptive.errors import InputError as InputError
+    from dehyst.adaptive.errors import ModelFileError as ModelFileError
+    from dehyst.adaptive.errors import NumericsError as NumericsError
+    from dehyst.adaptive.features import FeatureMap as FeatureMap
+    from dehyst.adaptive.identification import IdentificationReport as IdentificationReport
+    from dehyst.adaptive.identification import IdentifyConfig as IdentifyConfig
+    from dehyst.adaptive.identification import identify_lssvm as identify_lssvm
+    from dehyst.adaptive.inverse_model import LssvmInverse as LssvmInverse
+    from dehyst.adaptive.online.config import LearnerConfig as LearnerConfig
+    from dehyst.adaptive.online.learner import Learner as Learner
+    from dehyst.adaptive.types import Feedforward as Feedforward
+    from dehyst.adaptive.types import InverseModel as InverseModel
+    from dehyst.adaptive.types import OnlineModel as OnlineModel
+    from dehyst.adaptive.types import Sample as Sample
 
 __getattr__ = lazy_names(__name__)

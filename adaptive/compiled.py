@@ -17,7 +17,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from adaptive.types import FloatArray
+from dehyst.adaptive.types import FloatArray
 
 try:
     import numba

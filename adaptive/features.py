@@ -28,10 +28,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.state import Entry
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
 
 # --- The compiled loops: the memory after a point, and the inputs of a model at that point.
 

@@ -14,14 +14,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive import kernels, lssvm
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.smoothing import SmootherConfig, backward_difference, smooth_recording, zero_phase_lowpass
-from adaptive.tuning import evidence
-from adaptive.tuning.search import InferenceConfig, infer
-from adaptive.types import FloatArray
+from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.smoothing import SmootherConfig, backward_difference, smooth_recording, zero_phase_lowpass
+from dehyst.adaptive.tuning import evidence
+from dehyst.adaptive.tuning.search import InferenceConfig, infer
+from dehyst.adaptive.types import FloatArray
 
 # --- Settings.
 

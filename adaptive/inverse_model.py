@@ -16,12 +16,12 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import all_finite, compiled, compiled_reassociating, dot, in_numpy
-from adaptive.errors import InputError
-from adaptive.features import FeatureArrays, FeatureMap, advance, fill
-from adaptive.kernels import rbf_column, weigh
-from adaptive.state import Entry, Kinded, load, save
-from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
+from dehyst.adaptive.compiled import all_finite, compiled, compiled_reassociating, dot, in_numpy
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureArrays, FeatureMap, advance, fill
+from dehyst.adaptive.kernels import rbf_column, weigh
+from dehyst.adaptive.state import Entry, Kinded, load, save
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 
 # --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
 

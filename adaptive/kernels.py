@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled_contracting, compiled_reassociating, in_numpy
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled_contracting, compiled_reassociating, in_numpy
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 _LOG2_E = 1.4426950408889634
 _LN2_HIGH = 6.93147180369123816490e-01

@@ -19,8 +19,8 @@ import scipy.linalg  # noqa: F401 - it loads scipy's BLAS, which `_pools` must f
 from numba.extending import get_cython_function_address
 from threadpoolctl import ThreadpoolController
 
-from adaptive.errors import NumericsError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import NumericsError
+from dehyst.adaptive.types import FloatArray
 
 _INT = ctypes.POINTER(ctypes.c_int)
 _DOUBLES = ctypes.POINTER(ctypes.c_double)

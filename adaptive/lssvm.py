@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from adaptive import kernels, lapack
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import FloatArray, StateDict
+from dehyst.adaptive import kernels, lapack
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import FloatArray, StateDict
 
 
 def design(X: FloatArray, linear: tuple[int, ...]) -> FloatArray:

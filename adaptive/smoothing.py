@@ -19,10 +19,10 @@ from typing import Annotated
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.state import Entry
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
 
 #: Outputs of the smoother: displacement, velocity, acceleration.
 OUTPUTS = 3

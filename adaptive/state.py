@@ -44,8 +44,8 @@ from typing import (
 
 import numpy as np
 
-from adaptive.errors import ModelFileError
-from adaptive.types import StateDict, parted
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.types import StateDict, parted
 
 T = TypeVar("T")
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import all_finite
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import Learner
-from adaptive.smoothing import smooth_recording
-from adaptive.types import Sample
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.smoothing import smooth_recording
+from dehyst.adaptive.types import Sample
 
 
 def warm() -> None:

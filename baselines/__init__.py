@@ -3,7 +3,7 @@
 A linear, a Bouc-Wen and a Prandtl-Ishlinskii (MPI) model, each with identification, exact inverse and an online form::
 
     >>> import numpy as np
-    >>> from baselines import fit_linear
+    >>> from dehyst.baselines import fit_linear
     >>> u_V = np.linspace(0.0, 8.0, 50)
     >>> model, report = fit_linear(u_V, 2.0 + 11.0 * u_V, dt_s=1e-3)
     >>> y_um, still = np.array([24.0]), np.zeros(1)
@@ -17,21 +17,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.bouc_wen.identify import fit_bouc_wen as fit_bouc_wen
-    from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
-    from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
-    from baselines.common import FitReport as FitReport
-    from baselines.competition.champion import ChampionInverse as ChampionInverse
-    from baselines.competition.competition import Competition as Competition
-    from baselines.competition.config import CompetitionConfig as CompetitionConfig
-    from baselines.linear import LinearInverse as LinearInverse
-    from baselines.linear import LinearOnline as LinearOnline
-    from baselines.linear import fit_linear as fit_linear
-    from baselines.prandtl_ishlinskii.identify import fit_mpi as fit_mpi
-    from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
-    from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
+    from dehyst.baselines.bouc_wen.identify import fit_bouc_wen as fit_bouc_wen
+    from dehyst.baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
+    from dehyst.baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
+    from dehyst.baselines.common import FitReport as FitReport
+    from dehyst.baselines.competition.champion import ChampionInverse as ChampionInverse
+    from dehyst.baselines.competition.competition import Competition as Competition
+    from dehyst.baselines.competition.config import CompetitionConfig as CompetitionConfig
+    from dehyst.baselines.linear import LinearInverse as LinearInverse
+    from dehyst.baselines.linear import LinearOnline as LinearOnline
+    from dehyst.baselines.linear import fit_linear as fit_linear
+    from dehyst.baselines.prandtl_ishlinskii.identify import fit_mpi as fit_mpi
+    from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
+    from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
 __getattr__ = lazy_names(__name__)

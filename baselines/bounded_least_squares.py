@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import BoolArray, FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import BoolArray, FloatArray
 
 #: Least slope of an invertible curve, as a share of its mean slope.
 SLOPE_FLOOR = 0.02

@@ -8,10 +8,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.compiled import all_finite
-from adaptive.errors import InputError
-from adaptive.state import Entry
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
 
 # --- How well an identified baseline fits its recording, and the motion that the recording covers.
 

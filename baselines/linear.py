@@ -9,11 +9,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.errors import InputError
-from adaptive.state import Entry, load, save
-from adaptive.types import Feedforward, FloatArray, StateDict
-from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.common import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry, load, save
+from dehyst.adaptive.types import Feedforward, FloatArray, StateDict
+from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR
+from dehyst.baselines.common import (
     Domain,
     FitReport,
     checked_memory,
@@ -23,7 +23,7 @@ from baselines.common import (
     std_of_voltage,
     std_or_nan,
 )
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
+from dehyst.baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
 
 
 @dataclass(frozen=True)

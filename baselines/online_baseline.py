@@ -13,9 +13,9 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError, ModelFileError
-from adaptive.online.gates import (
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.online.gates import (
     DUPLICATE,
     GAP,
     LEARNT,
@@ -28,8 +28,8 @@ from adaptive.online.gates import (
     TIMING,
     UNEXCITED,
 )
-from adaptive.state import Entry, restore, save, within
-from adaptive.types import (
+from dehyst.adaptive.state import Entry, restore, save, within
+from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
@@ -41,7 +41,7 @@ from adaptive.types import (
     prefixed,
     under,
 )
-from baselines.bounded_least_squares import bounded_minimum
+from dehyst.baselines.bounded_least_squares import bounded_minimum
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
 #: Relative error of a time step above which the sample is refused.

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.types import Sample
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
-from baselines.bounded_least_squares import bounded_minimum
-from baselines.common import Domain
-from baselines.online_baseline import LeastSquaresConfig
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from baselines.prandtl_ishlinskii.online import MpiOnline
-from baselines.prandtl_ishlinskii.operators import play_run
-from baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
+from dehyst.adaptive.types import Sample
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
+from dehyst.baselines.bounded_least_squares import bounded_minimum
+from dehyst.baselines.common import Domain
+from dehyst.baselines.online_baseline import LeastSquaresConfig
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
 
 
 def warm() -> None:

@@ -67,27 +67,36 @@ import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-import adaptive.online
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
-from adaptive.online.config import LearnerConfig
-from adaptive.online.drift import DriftConfig, RestCreep
-from adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
-from adaptive.online.intake import Intake
-from adaptive.online.kernel_window import ResidualWindow
-from adaptive.online.learner import Judgement, Learner, Parts
-from adaptive.smoothing import smooth_recording
-from adaptive.types import FloatArray, InverseModel, Sample
+import dehyst.adaptive.online
 from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
 from benchmarks.measured import RECORDS, Cut, data_folder, replayed
-from lab.rehearsal import SENSOR, Event, IdentifiedPlant, PlantFactory, RehearsalConfig, draw, identify, run_event
-from lab.rehearsal.outcome import moving_mean
-from service.answers.guard import Limits
-from service.config.learner import learner_config
-from service.config.settings import LEARN
-from service.identification.identifying import Stretch, identify_one
-from service.reports.tables import markdown
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.drift import DriftConfig, RestCreep
+from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
+from dehyst.adaptive.online.intake import Intake
+from dehyst.adaptive.online.kernel_window import ResidualWindow
+from dehyst.adaptive.online.learner import Judgement, Learner, Parts
+from dehyst.adaptive.smoothing import smooth_recording
+from dehyst.adaptive.types import FloatArray, InverseModel, Sample
+from dehyst.lab.rehearsal import (
+    SENSOR,
+    Event,
+    IdentifiedPlant,
+    PlantFactory,
+    RehearsalConfig,
+    draw,
+    identify,
+    run_event,
+)
+from dehyst.lab.rehearsal.outcome import moving_mean
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.learner import learner_config
+from dehyst.service.config.settings import LEARN
+from dehyst.service.identification.identifying import Stretch, identify_one
+from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import motion
 from tests.foreign.plants import random_plant, with_traits
 
@@ -354,20 +363,20 @@ ORDER: Final = (
 
 def all_constants() -> list[Constant]:
     """Those of the modules of ``adaptive/online``."""
-    folder = Path(adaptive.online.__file__).parent
+    folder = Path(dehyst.adaptive.online.__file__).parent
     modules = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
     modules.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
     return [
         constant
         for name in modules
-        for constant in constants_of((folder / f"{name}.py").read_text(), f"adaptive.online.{name}")
+        for constant in constants_of((folder / f"{name}.py").read_text(), f"dehyst.adaptive.online.{name}")
     ]
 
 
 # --- Who reads a constant, and how it is shifted.
 
 #: Packages in which readers are looked for.
-PACKAGES: Final = ("adaptive", "baselines", "sim", "service", "lab", "benchmarks", "tests")
+PACKAGES: Final = ("dehyst", "benchmarks", "tests")
 #: A line of a file. A function is entered at its first line.
 Place = tuple[str, int]
 
@@ -1004,7 +1013,7 @@ def table(results: Results) -> str:
 def fingerprint(cases: Sequence[Case]) -> str:
     """Of the learner's source and of the cases: results of others cannot be compared."""
     digest = hashlib.sha256()
-    folder = Path(adaptive.online.__file__).parent
+    folder = Path(dehyst.adaptive.online.__file__).parent
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     digest.update("\n".join(sorted(case.name for case in cases)).encode())

@@ -27,27 +27,27 @@ from typing import Any, Final
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from adaptive.correction.integral import Correction, sensitivity
-from adaptive.identification import identify_lssvm
-from adaptive.types import FloatArray
-from baselines.prandtl_ishlinskii.identify import identify_mpi
-from baselines.prandtl_ishlinskii.model import MpiParameters
-from baselines.prandtl_ishlinskii.operators import play_step
 from benchmarks.measured import Source, data_folder
-from lab.rehearsal import RehearsalConfig, identify
-from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
-from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
-from lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
-from lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
-from service.answers.guard import Limits
-from service.client.correcting import Answer, Correcting
-from service.client.follower import Follower
-from service.config.correction import CorrectionConfig, RepetitionConfig
-from service.config.settings import LEARN, AxisConfig
-from service.protocol.model import ModelMessage, encode_model
-from service.protocol.samples import SampleBatch
-from service.reports.tables import markdown
-from service.server.axis_loading import load_axis
+from dehyst.adaptive.correction.integral import Correction, sensitivity
+from dehyst.adaptive.identification import identify_lssvm
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
+from dehyst.baselines.prandtl_ishlinskii.operators import play_step
+from dehyst.lab.rehearsal import RehearsalConfig, identify
+from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
+from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
+from dehyst.lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
+from dehyst.lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.correcting import Answer, Correcting
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.service.config.settings import LEARN, AxisConfig
+from dehyst.service.protocol.model import ModelMessage, encode_model
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.reports.tables import markdown
+from dehyst.service.server.axis_loading import load_axis
 from tests.foreign.motions import BEGIN_S, motion
 from tests.foreign.plants import random_plant
 

@@ -7,12 +7,12 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive import lssvm
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
-from adaptive.window import steps as window_core
-from adaptive.window.arrays import WindowArrays
-from adaptive.window.window import Form, Window, WindowConfig
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window import steps as window_core
+from dehyst.adaptive.window.arrays import WindowArrays
+from dehyst.adaptive.window.window import Form, Window, WindowConfig
 
 #: gamma and width for condition numbers from about 1e3 to 1e8 with windows of 100 samples in three dimensions.
 HARDNESS: tuple[tuple[float, float], ...] = ((1e2, 0.5), (1.5e3, 1.0), (1e4, 1.0), (1e5, 1.0), (1.2e6, 1.5))

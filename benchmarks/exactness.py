@@ -15,20 +15,20 @@ import numpy as np
 import zenoh
 from threadpoolctl import threadpool_limits
 
-from adaptive.types import StateDict
 from benchmarks.latency_setup import CONNECT_S, LatencySetup, RunningSetup
 from benchmarks.sample_feed import AXIS, STAGE, sent
-from service.background.retuner import Retuned
-from service.client.client import Client
-from service.config.settings import AxisConfig, read_config
-from service.failover.state_transfer import fetch_state
-from service.protocol.errors import ServiceError
-from service.protocol.model import fingerprint
-from service.protocol.samples import joined
-from service.security.authenticator import own_authenticator
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
+from dehyst.adaptive.types import StateDict
+from dehyst.service.background.retuner import Retuned
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import AxisConfig, read_config
+from dehyst.service.failover.state_transfer import fetch_state
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.protocol.samples import joined
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 #: Messages that the offline axis gets at a time; a live service never groups them so.
 _PORTION: Final = 37

@@ -35,8 +35,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import foreign_motions
-from lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
-from service.reports.tables import markdown
+from dehyst.lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
+from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import MOTIONS, motion
 
 PRESETS = ("random", "issue", "as_drawn")
@@ -70,7 +70,7 @@ Run = tuple[Callable[[], Record], Record]
 
 def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
     """One run with an event of the class ``name``, as JSON values. If it raises, the record holds the traceback."""
-    from lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
+    from dehyst.lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
     from tests.foreign.plants import issue_plant, random_plant
 
     begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -98,7 +98,7 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
 def run_healthy_stage(seed: int, block: int) -> Record:
     """A run of the learning loop alone, in which nothing happens, as JSON values. If it raises, the record holds the
     traceback."""
-    from lab.rehearsal import RehearsalConfig, identify, run_healthy
+    from dehyst.lab.rehearsal import RehearsalConfig, identify, run_healthy
     from tests.foreign.plants import random_plant
 
     begin, begin_cpu = time.perf_counter(), time.process_time()

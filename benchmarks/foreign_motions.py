@@ -17,8 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.protocol.query import BLENDED, OUTSIDE_DOMAIN, STAND_IN
-from service.reports.tables import json_form, markdown
+from dehyst.service.protocol.query import BLENDED, OUTSIDE_DOMAIN, STAND_IN
+from dehyst.service.reports.tables import json_form, markdown
 from tests.foreign.motions import MOTIONS, motion
 from tests.foreign.plants import Traits, random_plant
 
@@ -90,8 +90,8 @@ def run_motion(
     name: str, seed: int, recording: str = "full", after_s: float = AFTER_S, true_length: bool = False
 ) -> Record:
     """One motion on one stage, learning and frozen, as JSON values. If it raises, the record holds the traceback."""
-    from lab.rehearsal import Event, RehearsalConfig, identify, run_event
-    from lab.rehearsal.outcome import moving_mean
+    from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
+    from dehyst.lab.rehearsal.outcome import moving_mean
 
     begin, begin_cpu = time.perf_counter(), time.process_time()
     record: Record = {"seed": seed, "recording": recording, "motion": name}

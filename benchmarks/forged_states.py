@@ -25,22 +25,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import ModelFileError
-from adaptive.types import FloatArray, InverseModel, StateDict
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from benchmarks.small_models import small_models
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.failover.standby_model import StandbyModel
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, encode_checkpoint, restore_newest
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.types import FloatArray, InverseModel, StateDict
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.failover.standby_model import StandbyModel
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointMeta, encode_checkpoint, restore_newest
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 
 DT_S: Final = 1e-3
 #: Samples before a state is copied, and after it was taken; samples of a batch.

@@ -24,10 +24,10 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-#: Packages whose branches guide the mutations (atheris takes whole ones); everything else runs at full speed.
-INSTRUMENTED: Final = ("service",)
+#: The package whose branches guide the mutations (atheris takes whole ones), and its folders that run at full speed.
+PACKAGE, OTHERS = "dehyst", ("adaptive", "baselines", "sim", "lab")
 #: Modules with compiled functions: numba cannot compile what the fuzzer inserts.
-NOT_INSTRUMENTED: Final = ("service.answers.guard",)
+COMPILED: Final = ("dehyst.service.answers.guard",)
 _MAX_BYTES = 4096
 _SLOW_S = 5
 _RSS_LIMIT_MB = 2048
@@ -139,10 +139,14 @@ def _child(name: str, args: argparse.Namespace) -> int:
     import atheris
 
     # Modules that are imported here are instrumented, so they must not be imported yet.
-    for module in [m for m in sys.modules if m.split(".")[0] in ("service", "adaptive", "baselines", "benchmarks")]:
+    for module in [m for m in sys.modules if m.split(".")[0] in ("dehyst", "benchmarks")]:
         if module != "benchmarks.fuzz":
             del sys.modules[module]
-    with atheris.instrument_imports(INSTRUMENTED, NOT_INSTRUMENTED, enable_loader_override=False):
+    root = Path(__file__).resolve().parents[1]
+    paths = (path.relative_to(root).with_suffix("") for part in OTHERS for path in (root / part).rglob("*.py"))
+    others = (".".join((PACKAGE, *path.parts)).removesuffix(".__init__") for path in paths)
+    left_out = [PACKAGE, *COMPILED, *others]
+    with atheris.instrument_imports([PACKAGE], left_out, enable_loader_override=False):
         from benchmarks.fuzz_targets import TARGETS, WORDS, seeds
     words = args.out / f"words-{name}.txt"
     quoted = (word.replace("\\", "\\\\").replace('"', '\\"') for word in WORDS)

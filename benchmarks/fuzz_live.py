@@ -17,16 +17,16 @@ from typing import Any, Final
 import numpy as np
 import psutil
 
-from adaptive.errors import DehystError
 from benchmarks.fuzz_targets import seeds
 from benchmarks.mutations import mutated
 from benchmarks.small_models import small_models
-from lab.testbed.identified_stage import Rig, write_service_config
-from service.client.client import Client
-from service.protocol.errors import ServiceError
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.adaptive.errors import DehystError
+from dehyst.lab.testbed.identified_stage import Rig, write_service_config
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 
 _STAGE, _AXIS = "fuzz", "x"
 _PACE_HZ: Final = 200.0

@@ -15,23 +15,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.inverse_model import LssvmInverse
 from benchmarks.forged_states import edited, make_axis, recording
 from benchmarks.small_models import small_models
-from service.failover.role_control import Claims
-from service.operating.verbs import Request, decode_request, encode_request
-from service.protocol import delta as wire_delta
-from service.protocol import model as wire_model
-from service.protocol import query as wire_query
-from service.protocol import query as wire_reply
-from service.protocol import samples as wire
-from service.protocol.errors import error_from_json, error_to_json
-from service.protocol.keys import Keys
-from service.security.authenticator import Authenticator
-from service.security.tokens import Holder
-from service.stage_node.faults import decode_fault
-from service.storage import checkpoint
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.service.failover.role_control import Claims
+from dehyst.service.operating.verbs import Request, decode_request, encode_request
+from dehyst.service.protocol import delta as wire_delta
+from dehyst.service.protocol import model as wire_model
+from dehyst.service.protocol import query as wire_query
+from dehyst.service.protocol import query as wire_reply
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import error_from_json, error_to_json
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.security.authenticator import Authenticator
+from dehyst.service.security.tokens import Holder
+from dehyst.service.stage_node.faults import decode_fault
+from dehyst.service.storage import checkpoint
 
 Target = Callable[[bytes], None]
 #: What a decoder may raise on malformed bytes.

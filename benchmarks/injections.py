@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
 from benchmarks.measured import Source, data_folder
-from sim.diagnosis import diagnose_prepared, prepare
-from sim.recordings import Recording
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis import diagnose_prepared, prepare
+from dehyst.sim.recordings import Recording
 from tests.foreign.inject import ACCEPTED, beyond, inject, lagged
 
 

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import psutil
 
-from adaptive.types import FloatArray
 from benchmarks.exactness import Adopted, exactness
 from benchmarks.latency_setup import CONNECT_S, RunningSetup, running_setup
 from benchmarks.sample_feed import AXIS, STAGE
-from lab.testbed.identified_stage import WINDOW
-from lab.testbed.processes import ECHO_KEY
-from service.client.client import Client
-from service.protocol.query import Answer, Trajectory, encode_query, encode_reply
-from service.runtime.session import open_client
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.testbed.identified_stage import WINDOW
+from dehyst.lab.testbed.processes import ECHO_KEY
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.query import Answer, Trajectory, encode_query, encode_reply
+from dehyst.service.runtime.session import open_client
 
 TRAJECTORY = 100
 #: Timeout of a query, s: on a busy machine answers are late, and that is measured.

@@ -11,13 +11,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.types import FloatArray
 from benchmarks.sample_feed import AXIS, STAGE
-from lab.testbed.identified_stage import WINDOW, Rig, identify_stage, write_service_config
-from lab.testbed.processes import Child, free_port
-from sim.signals.references import demo_reference
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.testbed.identified_stage import WINDOW, Rig, identify_stage, write_service_config
+from dehyst.lab.testbed.processes import Child, free_port
+from dehyst.sim.signals.references import demo_reference
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 #: Range of the reference, µm.
 LOW_UM, HIGH_UM = 4.0, 80.0

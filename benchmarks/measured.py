@@ -28,22 +28,22 @@ from typing import Any
 import numpy as np
 from scipy.signal import savgol_filter
 
-from adaptive.errors import DehystError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import Learner
-from adaptive.smoothing import smooth_recording
-from adaptive.types import BoolArray, FloatArray, IntArray, InverseModel, Sample
-from baselines.competition.champion import ChampionInverse
-from service.answers.guard import Limits
-from service.config.learner import learner_config
-from service.config.settings import COMPETE, LEARN, AxisConfig
-from service.identification.identifying import Stretch, free_run, identify_one
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.reports import tables
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.smoothing import smooth_recording
+from dehyst.adaptive.types import BoolArray, FloatArray, IntArray, InverseModel, Sample
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.learner import learner_config
+from dehyst.service.config.settings import COMPETE, LEARN, AxisConfig
+from dehyst.service.identification.identifying import Stretch, free_run, identify_one
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.reports import tables
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 
 # --- The records.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import FloatArray
+from dehyst.adaptive.types import FloatArray
 
 #: Features of a sample: displacement, velocity and three play operators.
 DIMENSION = 5

@@ -6,9 +6,9 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from adaptive.warm import warm
 from benchmarks.drift import bench_drift
 from benchmarks.solver import bench_window
+from dehyst.adaptive.warm import warm
 
 SIZES = (100, 250, 500, 1000, 2000)
 

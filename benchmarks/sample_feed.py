@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.protocol.samples import SampleBatch
-from service.runtime.session import SURELY, open_client, wait_followed
-from service.runtime.stopping import StopSignal
-from service.security.authenticator import own_authenticator
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.runtime.session import SURELY, open_client, wait_followed
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.security.authenticator import own_authenticator
 
 STAGE, AXIS = "bench", "x"
 #: How long the stage waits for a subscriber before its first sample, s.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import InverseModel
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
 
 
 def small_models() -> dict[str, InverseModel]:

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.linalg import blas
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from adaptive import kernels
-from adaptive.compiled import compiled_reassociating
-from adaptive.types import FloatArray
-from adaptive.window.arrays import BETA
-from adaptive.window.window import Form, Window, WindowConfig
 from benchmarks.measuring import DIMENSION, GAMMA, WIDTH, Times, interleaved, stream, times
+from dehyst.adaptive import kernels
+from dehyst.adaptive.compiled import compiled_reassociating
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window.arrays import BETA
+from dehyst.adaptive.window.window import Form, Window, WindowConfig
 
 
 @compiled_reassociating

@@ -18,24 +18,24 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
-from baselines.common import Domain
-from baselines.competition.champion import ChampionInverse
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from service.answers.answering import Served, answer, blends, learns
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
-from service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
-from service.protocol.keys import AUTO, Keys
-from service.protocol.model import Safety, check_model, encode_model
-from service.protocol.query import Pending, Trajectory, decode_query, encode_query, encode_reply
-from service.protocol.samples import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
+from dehyst.baselines.common import Domain
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.service.answers.answering import Served, answer, blends, learns
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
+from dehyst.service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
+from dehyst.service.protocol.keys import AUTO, Keys
+from dehyst.service.protocol.model import Safety, check_model, encode_model
+from dehyst.service.protocol.query import Pending, Trajectory, decode_query, encode_query, encode_reply
+from dehyst.service.protocol.samples import (
     COMMAND,
     DELTA,
     FEEDFORWARD_QUERY,
@@ -45,7 +45,7 @@ from service.protocol.samples import (
     encode_reference,
     encode_samples,
 )
-from service.security.authenticator import Authenticator
+from dehyst.service.security.authenticator import Authenticator
 
 SEED: Final = 20
 DT_S: Final = 1e-3

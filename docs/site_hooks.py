@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import posixpath
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,13 @@ def rewritten(markdown: str, page: str) -> str:
         return f"]({posixpath.relpath(inside, posixpath.dirname(page) or '.')}{anchor})"
 
     return _LINK.sub(link, markdown)
+
+
+def on_config(config: Any) -> Any:
+    """Lay the packages out as they are installed: the reader of docstrings does not import them."""
+    command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", "build/typed"]
+    subprocess.run(command, cwd=ROOT, check=True, stderr=subprocess.DEVNULL)
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:

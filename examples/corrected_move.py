@@ -3,8 +3,8 @@
 import numpy as np
 from my_stage import RATE_HZ, open_stage
 
-from service.adapters import StageLoop
-from service.client import Client
+from dehyst import Client
+from dehyst.service.adapters import StageLoop
 
 SECONDS, FREQUENCY_HZ, RESYNCHRONISE_S = 10, 0.5, 0.25
 

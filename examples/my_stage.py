@@ -1,6 +1,6 @@
 """The stage of this lab: the one place that knows which controller moves it. The other programs import it."""
 
-from service.adapters.pi import PiStage
+from dehyst.service.adapters.pi import PiStage
 
 RATE_HZ = 100.0
 LOW_V, HIGH_V = 0.0, 80.0  # what may be applied: stay inside what your stage and amplifier allow

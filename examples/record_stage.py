@@ -4,7 +4,7 @@ from pathlib import Path
 
 from my_stage import HIGH_V, LOW_V, RATE_HZ, open_stage
 
-from service.adapters import excitation, record, write_recording
+from dehyst.service.adapters import excitation, record, write_recording
 
 with open_stage() as stage:
     recording = record(stage, excitation(LOW_V, HIGH_V, RATE_HZ, duration_s=30.0), progress=print)

@@ -4,8 +4,8 @@ import signal
 
 from my_stage import open_stage
 
-from service.adapters import StageLoop
-from service.client import Client
+from dehyst import Client
+from dehyst.service.adapters import StageLoop
 
 with open_stage() as stage, Client.connect("tcp/127.0.0.1:7447", stage="demo", axis="x", wait_s=10.0) as client:
     loop = StageLoop(stage, client)

@@ -10,9 +10,9 @@ import sys
 
 import numpy as np
 
-from service.storage.model_file import read_bundle
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.service.storage.model_file import read_bundle
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 U_MIN_V, U_MAX_V = 0.0, 8.0
 P_V_PER_UM, I_V_PER_UM_S = 0.01, 20.0  # the servo as it is: the mode at 450 Hz allows 27

@@ -6,13 +6,13 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from service.cli.main import COMMANDS as SERVICE_COMMANDS
-from service.cli.main import EXPERIMENTS, LAB, VIEWER, Command
-from service.cli.main import main as run
+from dehyst.service.cli.main import COMMANDS as SERVICE_COMMANDS
+from dehyst.service.cli.main import EXPERIMENTS, LAB, VIEWER, Command
+from dehyst.service.cli.main import main as run
 
 
 def _experiment(module: str, help_line: str, *extras: str) -> Command:
-    return Command(f"lab.commands.{module}", EXPERIMENTS, help_line, (LAB, *extras), compiles=True)
+    return Command(f"dehyst.lab.commands.{module}", EXPERIMENTS, help_line, (LAB, *extras), compiles=True)
 
 
 COMMANDS: Final[dict[str, Command]] = {

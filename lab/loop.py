@@ -15,12 +15,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.client.client import PendingCommands
-from service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.client.client import PendingCommands
+from dehyst.service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.sim.stage.stage import Stage
 
 
 def turns(blocks: int, ahead: int) -> Iterator[tuple[int | None, int | None]]:

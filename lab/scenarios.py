@@ -17,21 +17,21 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.identification import identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray
-from lab.loop import Asker, Twins, samples, turns
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.reports import tables
-from service.reports.plot_style import MOST_POINTS, figure, legend, line, save
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
-from service.viewer.colours import DIAGNOSTIC, EVENT, LIMIT, REFERENCE, model_colour
-from sim.scenarios import Scenario
-from sim.signals.voltages import training_input
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from dehyst.adaptive.identification import identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.reports import tables
+from dehyst.service.reports.plot_style import MOST_POINTS, figure, legend, line, save
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.service.viewer.colours import DIAGNOSTIC, EVENT, LIMIT, REFERENCE, model_colour
+from dehyst.sim.scenarios import Scenario
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 
 ADAPTIVE: Final = "lssvm_adaptive"
 FROZEN: Final = "lssvm_memory"

@@ -21,20 +21,20 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.online.gates import GAP
-from adaptive.types import BoolArray, FloatArray, InverseModel
-from service.answers.guard import Limits
-from service.config.learner import LearnerSettings
-from service.config.settings import AxisConfig
-from service.identification.identifying import motion_of
-from service.protocol.errors import FieldError
-from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.reports.plot_style import envelope, figure, legend, line, save
-from service.server.axis import Axis
-from service.storage.model_file import Bundle
-from service.viewer.colours import ADAPTIVE, DIAGNOSTIC, FROZEN, MEASURED, NOISE_BAND
-from sim.recordings import Recording, repaired
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.online.gates import GAP
+from dehyst.adaptive.types import BoolArray, FloatArray, InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.learner import LearnerSettings
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.identification.identifying import motion_of
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
+from dehyst.service.reports.plot_style import envelope, figure, legend, line, save
+from dehyst.service.server.axis import Axis
+from dehyst.service.storage.model_file import Bundle
+from dehyst.service.viewer.colours import ADAPTIVE, DIAGNOSTIC, FROZEN, MEASURED, NOISE_BAND
+from dehyst.sim.recordings import Recording, repaired
 
 # --- Replay.
 

@@ -1,4 +1,4 @@
-"""Compile every loop once, so that no process compiles at its start: ``python -m service.warm``.
+"""Compile every loop once, so that no process compiles at its start: ``python -m dehyst.service.warm``.
 
 A checkout does it at set-up. Installed from a wheel, the first command that needs the loops does it (`at_first_use`).
 
@@ -21,7 +21,7 @@ from typing import TextIO
 
 PACKAGES = ("adaptive", "baselines", "sim", "service", "lab")
 #: Modules with a ``warm()``. One process compiles each group, all at the same time.
-GROUPS = (("adaptive.warm",), ("baselines.warm", "sim.warm", "service.answers.guard"))
+GROUPS = (("dehyst.adaptive.warm",), ("dehyst.baselines.warm", "dehyst.sim.warm", "dehyst.service.answers.guard"))
 
 
 def digest(root: Path) -> str:

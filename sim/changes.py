@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray, InverseModel
-from baselines.prandtl_ishlinskii.operators import play_run, play_start
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import BoolArray, FloatArray, InverseModel
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run, play_start
 
 # --- Two stretches as one regression, cross-validated by blocks: what the frozen model always lacked, and what is new.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import BoolArray
+from dehyst.adaptive.types import BoolArray
 
 
 def runs(mask: BoolArray) -> NDArray[np.int64]:

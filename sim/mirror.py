@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import BoolArray, FloatArray
 
 #: Play thresholds, V; time constants of the creep, s, and its size, µm per µm, of each of them.
 _THRESHOLDS_V = np.geomspace(0.05, 3.0, 12)

@@ -12,9 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.fit_data import FitData
-from sim.masks import runs
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.masks import runs
 
 #: Most points of a line over time.
 MOST_POINTS = 4000

@@ -14,12 +14,12 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.signals.references import DemoReference, Motion, Reference, Sequenced, Shifted, Tones, in_band, strokes
-from sim.signals.voltages import sample_times
-from sim.stage.config import ParameterChange, StageConfig
-from sim.stage.presets import preset
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.signals.references import DemoReference, Motion, Reference, Sequenced, Shifted, Tones, in_band, strokes
+from dehyst.sim.signals.voltages import sample_times
+from dehyst.sim.stage.config import ParameterChange, StageConfig
+from dehyst.sim.stage.presets import preset
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.effects import EFFECTS, Chain, simulate
-from sim.effects.slew_limit import slew_ends
-from sim.effects.stick_slip import friction
-from sim.effects.timing import best_slip_move, date_slips, find_slips, resample
-from sim.fitting.dynamics import Dynamics, ForceLoop, ForceStops, respond
-from sim.fitting.hysteresis_loops import (
+from dehyst.sim.effects import EFFECTS, Chain, simulate
+from dehyst.sim.effects.slew_limit import slew_ends
+from dehyst.sim.effects.stick_slip import friction
+from dehyst.sim.effects.timing import best_slip_move, date_slips, find_slips, resample
+from dehyst.sim.fitting.dynamics import Dynamics, ForceLoop, ForceStops, respond
+from dehyst.sim.fitting.hysteresis_loops import (
     asymmetric,
     bouc_wen_loop,
     bouc_wen_paced,
@@ -17,9 +17,9 @@ from sim.fitting.hysteresis_loops import (
     grown_plays,
     plays_nested,
 )
-from sim.fitting.lags import lag_ends, slow_poles
-from sim.stage.presets import PRESETS
-from sim.stage.stage import Stage
+from dehyst.sim.fitting.lags import lag_ends, slow_poles
+from dehyst.sim.stage.presets import PRESETS
+from dehyst.sim.stage.stage import Stage
 
 
 def warm() -> None:

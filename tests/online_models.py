@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from adaptive.online.learner import Learner, Parts
-from adaptive.types import (
+from dehyst.adaptive.online.learner import Learner, Parts
+from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,

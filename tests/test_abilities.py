@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from adaptive.online.learner import Learner
-from adaptive.types import InverseModel, OnlineModel
-from baselines.bouc_wen.online import BoucWenOnline
-from baselines.competition.competition import Competition
-from baselines.linear import LinearOnline
-from baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import InverseModel, OnlineModel
+from dehyst.baselines.bouc_wen.online import BoucWenOnline
+from dehyst.baselines.competition.competition import Competition
+from dehyst.baselines.linear import LinearOnline
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 from tests.online_models import PlainModel
 
 ROOT = Path(__file__).resolve().parents[1]

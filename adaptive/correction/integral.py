@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray, InverseModel
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray, InverseModel
 
 #: Phase margin, rad, and gain margin of `design` for a model whose slope is right.
 PHASE_MARGIN: Final = math.pi / 3.0

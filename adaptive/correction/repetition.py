@@ -18,9 +18,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adaptive.correction.integral import LEAST_DAMPING
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.correction.integral import LEAST_DAMPING
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 #: Share of the residual that a pass corrects.
 GAIN: Final = 0.7

@@ -16,22 +16,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.fleet import step as steps
-from adaptive.fleet.snapshot import FleetSnapshot, snapshot_of
-from adaptive.fleet.state import OUTCOMES, FleetState, check_alike, distinct, fixed_of
-from adaptive.fleet.step import DOUBT, NO_SAMPLE, ODD, SAMPLE, TEACHES
-from adaptive.fleet.windows import CompiledWindows, Threads
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates
-from adaptive.online.config import LearnerConfig
-from adaptive.online.kernel_window import ResidualWindow
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, IntArray, Sample, StateDict, under
-from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.fleet import step as steps
+from dehyst.adaptive.fleet.snapshot import FleetSnapshot, snapshot_of
+from dehyst.adaptive.fleet.state import OUTCOMES, FleetState, check_alike, distinct, fixed_of
+from dehyst.adaptive.fleet.step import DOUBT, NO_SAMPLE, ODD, SAMPLE, TEACHES
+from dehyst.adaptive.fleet.windows import CompiledWindows, Threads
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.kernel_window import ResidualWindow
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, IntArray, Sample, StateDict, under
+from dehyst.adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED
 
 if TYPE_CHECKING:
-    from adaptive.fleet.in_torch import TorchWindows
+    from dehyst.adaptive.fleet.in_torch import TorchWindows
 
 #: Samples within which the matrices of all windows are written.
 WRITTEN_WITHIN = 256
@@ -91,7 +91,7 @@ class Fleet:
         if config.device == "cpu":
             self._windows: CompiledWindows | TorchWindows = CompiledWindows(self._state.rows, c, arrays, self._threads)
         else:
-            from adaptive.fleet.in_torch import TorchWindows
+            from dehyst.adaptive.fleet.in_torch import TorchWindows
 
             self._windows = TorchWindows(self._state.rows, c, arrays, config.device)
         self.apart: dict[int, Learner] = {}

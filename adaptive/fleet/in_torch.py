@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adaptive.fleet import windows
-from adaptive.fleet.state import Fixed, Rows
-from adaptive.online.kernel_window import NOWHERE, SAME
-from adaptive.types import FloatArray, IntArray
-from adaptive.window import arrays as ws
-from adaptive.window.arrays import ACCEPTED, WindowArrays
+from dehyst.adaptive.fleet import windows
+from dehyst.adaptive.fleet.state import Fixed, Rows
+from dehyst.adaptive.online.kernel_window import NOWHERE, SAME
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window.arrays import ACCEPTED, WindowArrays
 
 
 class TorchWindows:

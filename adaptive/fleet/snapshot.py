@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.fleet.state import Fixed, Rows
-from adaptive.fleet.windows import Threads
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed, unpacked
-from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray
-from adaptive.window.arrays import ALPHA, BETA, COUNT, GAMMA
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.fleet.state import Fixed, Rows
+from dehyst.adaptive.fleet.windows import Threads
+from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed, unpacked
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, IntArray
+from dehyst.adaptive.window.arrays import ALPHA, BETA, COUNT, GAMMA
 
 
 @compiled

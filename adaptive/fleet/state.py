@@ -13,15 +13,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.features import FeatureArrays
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
-from adaptive.online.gates import LEARNT, PASSED, REASONS
-from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.learner import MARK_S, Learner
-from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, parted
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureArrays
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.dead_reckoning import answers, drive_V, mean_slope
+from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS
+from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
+from dehyst.adaptive.online.learner import MARK_S, Learner
+from dehyst.adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, parted
 
 #: Results of a sample, by their number in a fleet.
 OUTCOMES: Final = (LEARNT, PASSED, *REASONS)

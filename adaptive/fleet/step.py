@@ -12,20 +12,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.compiled import compiled, dot
-from adaptive.features import FeatureArrays, advance, fill
-from adaptive.fleet.state import OUTCOMES, Fixed, Rows
-from adaptive.inverse_model import mean_of, track_memory, unpacked
-from adaptive.online import gates, intake, learner
-from adaptive.online.drift import RestCreep, update
-from adaptive.online.gates import AdmissionState
-from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.kernel_window import NOWHERE, KernelShare
-from adaptive.online.kernel_window import due as window_due
-from adaptive.online.learner import Judgement
-from adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
-from adaptive.smoothing import smooth_one
-from adaptive.types import BoolArray, FloatArray, IntArray
+from dehyst.adaptive.compiled import compiled, dot
+from dehyst.adaptive.features import FeatureArrays, advance, fill
+from dehyst.adaptive.fleet.state import OUTCOMES, Fixed, Rows
+from dehyst.adaptive.inverse_model import mean_of, track_memory, unpacked
+from dehyst.adaptive.online import gates, intake, learner
+from dehyst.adaptive.online.drift import RestCreep, update
+from dehyst.adaptive.online.gates import AdmissionState
+from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
+from dehyst.adaptive.online.kernel_window import NOWHERE, KernelShare
+from dehyst.adaptive.online.kernel_window import due as window_due
+from dehyst.adaptive.online.learner import Judgement
+from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
+from dehyst.adaptive.smoothing import smooth_one
+from dehyst.adaptive.types import BoolArray, FloatArray, IntArray
 
 #: In place of an outcome: no sample; the sample is due for learning; it is for a single learner from its intake on, or
 #: from what it teaches on.

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.fleet.state import Fixed, Rows
-from adaptive.online import kernel_window as window
-from adaptive.types import FloatArray, IntArray
-from adaptive.window import arrays as ws
-from adaptive.window import steps
-from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.fleet.state import Fixed, Rows
+from dehyst.adaptive.online import kernel_window as window
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import steps
+from dehyst.adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
 
 #: Fewest axes for which a second thread is worth its wake-up.
 _LEAST_AXES = 16

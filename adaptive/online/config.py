@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from adaptive.errors import InputError
-from adaptive.online.drift import DriftConfig
-from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
-from adaptive.online.kernel_window import Eviction
-from adaptive.smoothing import SmootherConfig
-from adaptive.types import StateDict, joined, under
-from adaptive.window.window import SolverConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.online.drift import DriftConfig
+from dehyst.adaptive.online.gates import AdmissionConfig, EnvelopeConfig
+from dehyst.adaptive.online.kernel_window import Eviction
+from dehyst.adaptive.smoothing import SmootherConfig
+from dehyst.adaptive.types import StateDict, joined, under
+from dehyst.adaptive.window.window import SolverConfig
 
 #: Groups of settings that are tables of their own.
 _TABLES: Final[dict[str, type[Any]]] = {

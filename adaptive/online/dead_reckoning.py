@@ -25,11 +25,11 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.features import FeatureMap, advance
-from adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
-from adaptive.state import Entry
-from adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.features import FeatureMap, advance
+from dehyst.adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray, IntArray
 
 #: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
 STEPS, SLOPE_SHARE = 2, 1e-5

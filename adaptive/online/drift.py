@@ -18,11 +18,11 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from adaptive.compiled import compiled, shared
-from adaptive.errors import InputError
-from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
-from adaptive.state import Entry
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled, shared
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
 
 # --- The drift filter's algebra, compiled: one scalar measurement of a random walk, in O(p²).
 #

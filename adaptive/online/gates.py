@@ -16,11 +16,11 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import shared
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.state import Entry
-from adaptive.types import Sample
+from dehyst.adaptive.compiled import shared
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import Sample
 
 # --- Gates.
 

@@ -19,13 +19,13 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.features import FeatureMap
-from adaptive.online.dead_reckoning import Reckoning
-from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
-from adaptive.online.track import Step
-from adaptive.state import Entry
-from adaptive.types import BoolArray, FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.online.dead_reckoning import Reckoning
+from dehyst.adaptive.online.gates import AdmissionConfig, EnvelopeConfig
+from dehyst.adaptive.online.track import Step
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import BoolArray, FloatArray
 
 # --- The level at which readings settle. The distances r(k) of the readings from the dead-reckoned position are fitted:
 #

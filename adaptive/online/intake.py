@@ -20,21 +20,21 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from adaptive.compiled import shared
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates as admission
-from adaptive.online import glitch_or_jump as hypotheses
-from adaptive.online.config import LearnerConfig
-from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
-from adaptive.online.gates import AdmissionState
-from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
-from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
-from adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following, Outcome, Trial
-from adaptive.online.track import Pair, Past, Step, Taken, Track
-from adaptive.smoothing import smoother_of
-from adaptive.state import Entry, restore, save
-from adaptive.types import FloatArray, Sample
+from dehyst.adaptive.compiled import shared
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.online import glitch_or_jump as hypotheses
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
+from dehyst.adaptive.online.gates import AdmissionState
+from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
+from dehyst.adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
+from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following, Outcome, Trial
+from dehyst.adaptive.online.track import Pair, Past, Step, Taken, Track
+from dehyst.adaptive.smoothing import smoother_of
+from dehyst.adaptive.state import Entry, restore, save
+from dehyst.adaptive.types import FloatArray, Sample
 
 #: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5

@@ -7,18 +7,18 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from adaptive import kernels
-from adaptive.compiled import shared
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates as admission
-from adaptive.state import Entry, load, rows, save
-from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
-from adaptive.window import arrays as ws
-from adaptive.window import steps
-from adaptive.window.arrays import Status, WindowArrays
-from adaptive.window.healing import Healing, HealingState
-from adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
+from dehyst.adaptive import kernels
+from dehyst.adaptive.compiled import shared
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.state import Entry, load, rows, save
+from dehyst.adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import steps
+from dehyst.adaptive.window.arrays import Status, WindowArrays
+from dehyst.adaptive.window.healing import Healing, HealingState
+from dehyst.adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
 
 Eviction = Literal["nearest", "fifo"]
 #: A sample with a kernel value above this to a held one takes its slot even where there are free slots.

@@ -16,22 +16,22 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from adaptive.compiled import shared
-from adaptive.errors import DehystError, ModelFileError
-from adaptive.features import ACCELERATION, VELOCITY, FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates as admission
-from adaptive.online.config import LearnerConfig
-from adaptive.online.dead_reckoning import Reckoning, drive_V
-from adaptive.online.drift import DriftFilter, Mark, RestCreep
-from adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
-from adaptive.online.glitch_or_jump import level_of
-from adaptive.online.intake import Intake
-from adaptive.online.kernel_window import ResidualWindow, due
-from adaptive.online.missing_motion import MissingMotion
-from adaptive.online.track import Pair
-from adaptive.state import Entry, Refused, restore, save, within
-from adaptive.types import (
+from dehyst.adaptive.compiled import shared
+from dehyst.adaptive.errors import DehystError, ModelFileError
+from dehyst.adaptive.features import ACCELERATION, VELOCITY, FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
+from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
+from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
+from dehyst.adaptive.online.glitch_or_jump import level_of
+from dehyst.adaptive.online.intake import Intake
+from dehyst.adaptive.online.kernel_window import ResidualWindow, due
+from dehyst.adaptive.online.missing_motion import MissingMotion
+from dehyst.adaptive.online.track import Pair
+from dehyst.adaptive.state import Entry, Refused, restore, save, within
+from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,

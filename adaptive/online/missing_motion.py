@@ -20,11 +20,11 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.features import advance, fill
-from adaptive.inverse_model import LssvmInverse, mean_of, track_memory, unpacked
-from adaptive.state import Entry
-from adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.features import advance, fill
+from dehyst.adaptive.inverse_model import LssvmInverse, mean_of, track_memory, unpacked
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray, IntArray
 
 #: Turning points, as shares of the way from the two known places to the farthest one that can be reached.
 TURNS: Final = (0.0, 0.1, 0.4, 1.0)

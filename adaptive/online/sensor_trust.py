@@ -34,12 +34,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from adaptive.compiled import shared
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.dead_reckoning import Reckoning, drive_V
-from adaptive.online.glitch_or_jump import Circumstances, tolerance_um
-from adaptive.state import Entry
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import shared
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
+from dehyst.adaptive.online.glitch_or_jump import Circumstances, tolerance_um
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
 
 # --- The check that always runs.
 

@@ -7,12 +7,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from adaptive.features import FeatureMap, advance_both
-from adaptive.inverse_model import track_memory
-from adaptive.online.dead_reckoning import Reckoning
-from adaptive.smoothing import FixedLagSmoother, SmootherState
-from adaptive.state import Entry
-from adaptive.types import BoolArray, FloatArray
+from dehyst.adaptive.features import FeatureMap, advance_both
+from dehyst.adaptive.inverse_model import track_memory
+from dehyst.adaptive.online.dead_reckoning import Reckoning
+from dehyst.adaptive.smoothing import FixedLagSmoother, SmootherState
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import BoolArray, FloatArray
 
 Motion = tuple[float, float, float]
 

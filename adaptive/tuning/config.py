@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adaptive.errors import InputError
+from dehyst.adaptive.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)

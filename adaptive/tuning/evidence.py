@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive import kernels, lapack, lssvm
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive import kernels, lapack, lssvm
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

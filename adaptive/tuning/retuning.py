@@ -14,15 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError, NumericsError
-from adaptive.lapack import one_thread
-from adaptive.online.kernel_window import SAME
-from adaptive.tuning.config import RetuneConfig
-from adaptive.tuning.evidence import EvidenceSamples, evidence_samples
-from adaptive.tuning.search import REFUSED, CountedEvidence, descend
-from adaptive.types import BoolArray, FloatArray, Hyperparameters, WindowData
-from adaptive.window.arrays import Status
-from adaptive.window.window import Window, WindowConfig
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.online.kernel_window import SAME
+from dehyst.adaptive.tuning.config import RetuneConfig
+from dehyst.adaptive.tuning.evidence import EvidenceSamples, evidence_samples
+from dehyst.adaptive.tuning.search import REFUSED, CountedEvidence, descend
+from dehyst.adaptive.types import BoolArray, FloatArray, Hyperparameters, WindowData
+from dehyst.adaptive.window.arrays import Status
+from dehyst.adaptive.window.window import Window, WindowConfig
 
 #: ``search(data, start, low, high)``: (s, 1 + d) starts worth a descent, best first, in logarithms of gamma and widths.
 Search = Callable[[EvidenceSamples, FloatArray, FloatArray, FloatArray], FloatArray]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from adaptive.errors import InputError, NumericsError
-from adaptive.lapack import one_thread
-from adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
+from dehyst.adaptive.types import FloatArray
 
 #: The chapter's start, first; the others because the evidence has several optima.
 STARTS: tuple[tuple[float, float], ...] = ((100.0, 1.0), (1e4, 0.4), (1e5, 2.5), (1e3, 6.0))

@@ -17,8 +17,8 @@ import numpy as np
 from numba import carray, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray, IntArray
 
 
 class WindowArrays(NamedTuple):

@@ -22,9 +22,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled_reassociating, dot
-from adaptive.types import FloatArray
-from adaptive.window.arrays import (
+from dehyst.adaptive.compiled import compiled_reassociating, dot
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window.arrays import (
     BITS,
     CARRIED,
     COUNT,

@@ -12,12 +12,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from adaptive.errors import NumericsError
-from adaptive.state import Entry
-from adaptive.types import FloatArray, IntArray
-from adaptive.window import arrays as ws
-from adaptive.window import steps
-from adaptive.window.window import Window
+from dehyst.adaptive.errors import NumericsError
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import steps
+from dehyst.adaptive.window.window import Window
 
 # --- A refresh costs O(N³), as much as some hundred steps. It has three parts: `begin` copies the state (stepping
 # thread, O(N²)), `Refresh.factor` factors the copy (any thread, without the interpreter's lock), `Refresh.finish`

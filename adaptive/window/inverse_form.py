@@ -8,9 +8,9 @@ what makes such recursions diverge.
 
 from __future__ import annotations
 
-from adaptive.compiled import compiled_reassociating, dot
-from adaptive.types import FloatArray
-from adaptive.window.arrays import COUNT, MINUS, PENDING, PLUS, UNDO, UNDO_NOTHING, WindowArrays
+from dehyst.adaptive.compiled import compiled_reassociating, dot
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window.arrays import COUNT, MINUS, PENDING, PLUS, UNDO, UNDO_NOTHING, WindowArrays
 
 #: From this size on four rows at a time are faster than two.
 _FOUR_ROWS = 400

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled, compiled_reassociating, dot
-from adaptive.kernels import rbf_column
-from adaptive.types import FloatArray, IntArray
-from adaptive.window import cholesky_form as cholesky
-from adaptive.window import inverse_form as inverse
-from adaptive.window.arrays import (
+from dehyst.adaptive.compiled import compiled, compiled_reassociating, dot
+from dehyst.adaptive.kernels import rbf_column
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import cholesky_form as cholesky
+from dehyst.adaptive.window import inverse_form as inverse
+from dehyst.adaptive.window.arrays import (
     ACCEPTED,
     ALPHA,
     BAD_INPUT,

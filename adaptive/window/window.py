@@ -13,13 +13,13 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from adaptive import kernels, lapack, lssvm
-from adaptive.errors import InputError, NumericsError
-from adaptive.state import Entry
-from adaptive.types import FloatArray, IntArray
-from adaptive.window import arrays as ws
-from adaptive.window import cholesky_form, steps
-from adaptive.window.arrays import Status, WindowArrays
+from dehyst.adaptive import kernels, lapack, lssvm
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import cholesky_form, steps
+from dehyst.adaptive.window.arrays import Status, WindowArrays
 
 # --- Configuration.
 

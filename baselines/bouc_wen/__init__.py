@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.bouc_wen.identify import identify_bouc_wen as identify_bouc_wen
-    from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
-    from baselines.bouc_wen.model import BoucWenParameters as BoucWenParameters
-    from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
+    from dehyst.baselines.bouc_wen.identify import identify_bouc_wen as identify_bouc_wen
+    from dehyst.baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
+    from dehyst.baselines.bouc_wen.model import BoucWenParameters as BoucWenParameters
+    from dehyst.baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
 
 __getattr__ = lazy_names(__name__)

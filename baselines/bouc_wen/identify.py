@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult, least_squares
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
-from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from baselines.common import FitReport, checked_recording, std_of_voltage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
+from dehyst.baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
+from dehyst.baselines.common import FitReport, checked_recording, std_of_voltage
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])

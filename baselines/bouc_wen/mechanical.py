@@ -27,10 +27,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import FloatArray
-from baselines.common import finite_series, positive
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.common import finite_series, positive
 
 
 def between_samples(u: FloatArray, factor: int) -> FloatArray:

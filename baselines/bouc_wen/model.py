@@ -22,12 +22,12 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.state import Entry, load, save
-from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
-from baselines.common import (
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry, load, save
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from dehyst.baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
+from dehyst.baselines.common import (
     Domain,
     checked_memory,
     checked_motion,

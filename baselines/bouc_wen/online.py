@@ -15,15 +15,15 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import all_finite, compiled
-from adaptive.errors import InputError
-from adaptive.online import drift as drift_step
-from adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
-from adaptive.state import Entry
-from adaptive.types import FloatArray
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
-from baselines.online_baseline import OnlineBaseline
+from dehyst.adaptive.compiled import all_finite, compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.online import drift as drift_step
+from dehyst.adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.model import BoucWenInverse
+from dehyst.baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
+from dehyst.baselines.online_baseline import OnlineBaseline
 
 #: Relative increase of one shape parameter in each copy of the model.
 _NUDGE = 1e-3

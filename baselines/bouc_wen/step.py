@@ -17,8 +17,8 @@ import math
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
 
 #: Below this |rate| (1/V) a line replaces the exponential of (2.2): better conditioned, and equal to 1e-8 V.
 _FLAT = 1e-7

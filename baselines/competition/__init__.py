@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.competition.champion import ChampionInverse as ChampionInverse
-    from baselines.competition.competition import Competition as Competition
-    from baselines.competition.config import CompetitionConfig as CompetitionConfig
+    from dehyst.baselines.competition.champion import ChampionInverse as ChampionInverse
+    from dehyst.baselines.competition.competition import Competition as Competition
+    from dehyst.baselines.competition.config import CompetitionConfig as CompetitionConfig
 
 __getattr__ = lazy_names(__name__)

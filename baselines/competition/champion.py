@@ -17,14 +17,14 @@ from typing import Annotated, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse, evaluate_point
-from adaptive.state import Entry, Refused, load, save, within
-from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.linear import LinearInverse
-from baselines.prandtl_ishlinskii.model import MpiInverse
+from dehyst.adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse, evaluate_point
+from dehyst.adaptive.state import Entry, Refused, load, save, within
+from dehyst.adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
+from dehyst.baselines.bouc_wen.model import BoucWenInverse
+from dehyst.baselines.linear import LinearInverse
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse
 
 #: Class of a contestant's inverse model by the name that stored states use.
 INVERSE_KINDS: Final[dict[str, Any]] = {

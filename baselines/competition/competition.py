@@ -19,12 +19,12 @@ from typing import Annotated, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates
-from adaptive.online.learner import Learner, Parts
-from adaptive.state import Entry, Refused, load, part_of, restore, save
-from adaptive.types import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates
+from dehyst.adaptive.online.learner import Learner, Parts
+from dehyst.adaptive.state import Entry, Refused, load, part_of, restore, save
+from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
@@ -35,13 +35,13 @@ from adaptive.types import (
     WindowData,
     prefixed,
 )
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.bouc_wen.online import BoucWenOnline
-from baselines.competition.champion import ChampionInverse
-from baselines.competition.config import CompetitionConfig
-from baselines.linear import LinearInverse, LinearOnline
-from baselines.prandtl_ishlinskii.model import MpiInverse
-from baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.baselines.bouc_wen.model import BoucWenInverse
+from dehyst.baselines.bouc_wen.online import BoucWenOnline
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.baselines.competition.config import CompetitionConfig
+from dehyst.baselines.linear import LinearInverse, LinearOnline
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 
 # --- Which online models can compete, and how an identified baseline starts one.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from adaptive.errors import InputError
-from adaptive.types import StateDict
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import StateDict
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.prandtl_ishlinskii.identify import MpiGrid as MpiGrid
-    from baselines.prandtl_ishlinskii.identify import identify_mpi as identify_mpi
-    from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
-    from baselines.prandtl_ishlinskii.model import MpiParameters as MpiParameters
-    from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
+    from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid as MpiGrid
+    from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi as identify_mpi
+    from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
+    from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters as MpiParameters
+    from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
 __getattr__ = lazy_names(__name__)

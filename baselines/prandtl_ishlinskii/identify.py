@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
-from baselines.common import FitReport, checked_recording, std_of_voltage
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, from_inverse_saturation
-from baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
+from dehyst.baselines.common import FitReport, checked_recording, std_of_voltage
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, from_inverse_saturation
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
 
 #: Weight of the scale constraint relative to the mean row; rescaling makes the constraint exact afterwards.
 _SCALE_WEIGHT = 1e3

@@ -20,11 +20,11 @@ from typing import Annotated
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.state import Entry, load, save
-from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from baselines.common import (
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import Entry, load, save
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from dehyst.baselines.common import (
     Domain,
     checked_memory,
     checked_motion,
@@ -32,7 +32,7 @@ from baselines.common import (
     positive,
     std_or_nan,
 )
-from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
+from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
 
 
 def inverse_weights(w: FloatArray) -> FloatArray:

@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.online.drift import joseph, walk
-from adaptive.state import Entry
-from adaptive.types import FloatArray
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
-from baselines.prandtl_ishlinskii.identify import MpiGrid
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, inverse_thresholds, inverse_weights
-from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.online.drift import joseph, walk
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
+from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, inverse_thresholds, inverse_weights
+from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
 
 #: Random walk of gain and offset per square root of a second of teaching: relative, and as a share of the stroke.
 GAIN_WALK, OFFSET_WALK = 0.02, 0.01

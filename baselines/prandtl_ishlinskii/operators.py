@@ -3,7 +3,7 @@
 **Play** (backlash), here with threshold 1 V, driven up and down from rest::
 
     >>> import numpy as np
-    >>> from baselines.prandtl_ishlinskii.operators import dead_zone, dead_zone_sum, play_run, play_start
+    >>> from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, dead_zone_sum, play_run, play_start
     >>> path_V = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 2.5, 1.0, 0.5, 0.0, 3.0])
     >>> state = play_start(0.0, np.array([1.0]))
     >>> play_run(path_V, np.array([1.0]), state)[:, 0].tolist()
@@ -33,8 +33,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
 
 
 @compiled

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.swarm.evidence_search import EvidenceSearch as EvidenceSearch
-    from baselines.swarm.identification import MissingTorchError as MissingTorchError
-    from baselines.swarm.identification import swarm_bouc_wen as swarm_bouc_wen
-    from baselines.swarm.identification import swarm_mpi as swarm_mpi
+    from dehyst.baselines.swarm.evidence_search import EvidenceSearch as EvidenceSearch
+    from dehyst.baselines.swarm.identification import MissingTorchError as MissingTorchError
+    from dehyst.baselines.swarm.identification import swarm_bouc_wen as swarm_bouc_wen
+    from dehyst.baselines.swarm.identification import swarm_mpi as swarm_mpi
 
 __getattr__ = lazy_names(__name__)

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.tuning.evidence import EvidenceSamples
-from adaptive.tuning.retuning import pattern
-from adaptive.types import FloatArray
-from baselines.swarm.identification import torch_module
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.tuning.evidence import EvidenceSamples
+from dehyst.adaptive.tuning.retuning import pattern
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.swarm.identification import torch_module
 
 #: J2 of a point whose kernel matrix cannot be factored.
 _REFUSED = 1e12

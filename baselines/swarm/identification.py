@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.compiled import compiled
-from adaptive.errors import DehystError, InputError
-from adaptive.types import FloatArray
-from baselines.bouc_wen.model import BoucWenParameters
-from baselines.bouc_wen.step import hysteresis_step, poles, run_stage
-from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.common import FitReport, checked_recording
-from baselines.prandtl_ishlinskii.identify import MpiGrid
-from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
-from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import DehystError, InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.model import BoucWenParameters
+from dehyst.baselines.bouc_wen.step import hysteresis_step, poles, run_stage
+from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR
+from dehyst.baselines.common import FitReport, checked_recording
+from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
+from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
 
 # --- Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts.
 

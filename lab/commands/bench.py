@@ -11,8 +11,8 @@ import json
 import sys
 from pathlib import Path
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared
 
 EPILOG = """\
 Times are medians of single calls in µs, measured in turns with one BLAS thread. Compare ratios across machines, not

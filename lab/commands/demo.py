@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
-from service.runtime.stopping import StopSignal
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared, check_seed, progress_printer
+from dehyst.service.runtime.stopping import StopSignal
 
 log = logging.getLogger("dehyst.demo")
 
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing was measured."""
     if args.mirror:
         return _run_mirror(args)
-    from lab.demo import session
+    from dehyst.lab.demo import session
 
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
         raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s; the table needs a settled part")
@@ -117,8 +117,8 @@ def _run_mirror(args: argparse.Namespace) -> int:
     if not (math.isfinite(args.duration) and 1.5 <= args.duration <= 3600.0):
         raise InputError(f"--duration: got {args.duration:g} s, expected 1.5 to 3600 s with --mirror")
     check_seed(args.seed)
-    from lab.demo import mirror
-    from sim.mirror import MirrorConfig
+    from dehyst.lab.demo import mirror
+    from dehyst.sim.mirror import MirrorConfig
 
     stop, show = StopSignal(raising=True), progress_printer(args.quiet)
 
@@ -143,7 +143,7 @@ def _run_mirror(args: argparse.Namespace) -> int:
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
-    from lab.demo.result import clock_missed, pace, table
+    from dehyst.lab.demo.result import clock_missed, pace, table
 
     samples, ticks = summary["samples"], summary["ticks"]
     files = {

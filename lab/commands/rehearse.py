@@ -9,11 +9,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
-from service.cli.python_file import load_object
-from service.protocol.errors import FieldError
-from service.runtime.stopping import StopSignal
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared, check_seed, progress_printer
+from dehyst.service.cli.python_file import load_object
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.stopping import StopSignal
 
 EPILOG = """\
 FILE.py:NAME is a Python class, function or object: voltages of a block in (V), true displacement and reading out (µm).
@@ -52,9 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load, identify, run, draw. Returns 0 if no run failed, else 1."""
-    from lab.rehearsal import CLASSES, EVENT_KINDS, STANDARD, RehearsalConfig, factory_of, rehearse, standard_events
-    from lab.rehearsal.rehearsal import remarks, table
-    from service.storage.output import clear_output
+    from dehyst.lab.rehearsal import (
+        CLASSES,
+        EVENT_KINDS,
+        STANDARD,
+        RehearsalConfig,
+        factory_of,
+        rehearse,
+        standard_events,
+    )
+    from dehyst.lab.rehearsal.rehearsal import remarks, table
+    from dehyst.service.storage.output import clear_output
 
     if args.events == "list":
         for name, (kind_name, _) in CLASSES.items():
@@ -89,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         (args.out / "rehearsal.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         (args.out / "rehearsal.md").write_text(table(done, markdown=True) + "\n", encoding="utf-8")
         if not args.no_pictures:
-            from lab.rehearsal.rehearsal import draw_rehearsal
+            from dehyst.lab.rehearsal.rehearsal import draw_rehearsal
 
             draw_rehearsal(args.out / "rehearsal.png", done)
     except OSError as error:

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
 
 EPILOG = """\
 Writes DIR/report.md (the chapter's numbers beside ours), DIR/tables.json, and one PNG for each figure in a folder for
@@ -43,10 +43,10 @@ def run(args: argparse.Namespace) -> int:
     """Run the study and write it. Returns 0, also where a target is missed: the summary says so."""
     from threadpoolctl import threadpool_limits
 
-    from lab.reproduce.measured import StudyConfig, run_study
-    from lab.reproduce.report import write_study
-    from service.protocol.errors import FieldError
-    from service.storage.output import clear_output
+    from dehyst.lab.reproduce.measured import StudyConfig, run_study
+    from dehyst.lab.reproduce.report import write_study
+    from dehyst.service.protocol.errors import FieldError
+    from dehyst.service.storage.output import clear_output
 
     clear_output(args.out)
     if args.data is not None and not args.data.is_dir():

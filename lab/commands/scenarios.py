@@ -11,11 +11,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.protocol.errors import FieldError
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from lab.scenarios import Verdict
+    from dehyst.lab.scenarios import Verdict
 
 EPILOG = """\
 Two twin stages have the same noise and the same reference. The learning model steers one, the same model as identified
@@ -45,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
-    from lab.scenarios import draw_overview, table
-    from service.config.learner import read_learner_settings
-    from service.storage.output import clear_output
+    from dehyst.lab.scenarios import draw_overview, table
+    from dehyst.service.config.learner import read_learner_settings
+    from dehyst.service.storage.output import clear_output
 
     if not 1 <= args.seeds <= 1000:
         raise FieldError("--seeds", args.seeds, "an integer from 1 to 1000")
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _chosen(only: list[str], seeds: int) -> list[tuple[str, int]]:
-    from sim.scenarios import SCENARIO_KINDS
+    from dehyst.sim.scenarios import SCENARIO_KINDS
 
     every = [(kind, seed) for kind in SCENARIO_KINDS for seed in range(1, seeds + 1)]
     if not only:
@@ -115,8 +115,8 @@ def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs:
 
 
 def _one(task: tuple[str, int, float, dict[str, Any], Path | None]) -> Verdict:
-    from lab.scenarios import draw_course, judge, run_scenario
-    from sim.scenarios import scenario
+    from dehyst.lab.scenarios import draw_course, judge, run_scenario
+    from dehyst.sim.scenarios import scenario
 
     kind, seed, rest_s, settings, out = task
     course = run_scenario(scenario(kind, seed, rest_s), settings)

@@ -8,8 +8,8 @@ import math
 import re
 from pathlib import Path
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared, check_seed, progress_printer
 
 EPILOG = """\
 In real time the soak runs these processes on loopback: a router, two services (one a hot standby), a simulated stage, a
@@ -48,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the soak. Returns 0 if every invariant held, 1 if one did not, 130 if interrupted."""
-    from lab.soak.fault_plan import FAULT_KINDS, make_plan, select_kinds
-    from service.runtime.stopping import StopSignal
+    from dehyst.lab.soak.fault_plan import FAULT_KINDS, make_plan, select_kinds
+    from dehyst.service.runtime.stopping import StopSignal
 
     if args.list:
         for name, kind in FAULT_KINDS.items():
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
     if args.fast:
         kinds = tuple(name for name in kinds if FAULT_KINDS[name].fast)
     stop = StopSignal()
-    from lab.soak import session as soak
-    from lab.soak.report import HELD, verdict_line
+    from dehyst.lab.soak import session as soak
+    from dehyst.lab.soak.report import HELD, verdict_line
 
     done = soak.run(
         args.out,

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from lab.demo.plan import Plan as Plan
-    from lab.demo.result import DemoRun as DemoRun
-    from lab.demo.result import table as table
-    from lab.demo.session import run as run
+    from dehyst.lab.demo.plan import Plan as Plan
+    from dehyst.lab.demo.result import DemoRun as DemoRun
+    from dehyst.lab.demo.result import table as table
+    from dehyst.lab.demo.session import run as run
 
 __getattr__ = lazy_names(__name__)

@@ -1,7 +1,7 @@
 """The controller: follows the models or asks the service ahead, sends voltages, records the readings.
 
-``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it computes a block
-when the stage has published the tick that the plan gives. Progress goes to standard output as lines of JSON.
+``python -m dehyst.lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it computes a
+block when the stage has published the tick that the plan gives. Progress goes to standard output as lines of JSON.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from adaptive.types import FloatArray
-from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
-from lab.demo.result import empty
-from lab.testbed.processes import run_client_process
-from service.client.client import Client, PendingCommands
-from service.client.follower import Follower
-from service.protocol import samples as wire
-from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
-from service.protocol.keys import Keys
-from service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
-from service.runtime.session import SURELY, open_client, wait_followed
-from service.security.authenticator import own_authenticator
-from service.security.lease import CommandLease
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
+from dehyst.lab.demo.result import empty
+from dehyst.lab.testbed.processes import run_client_process
+from dehyst.service.client.client import Client, PendingCommands
+from dehyst.service.client.follower import Follower
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
+from dehyst.service.runtime.session import SURELY, open_client, wait_followed
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.security.lease import CommandLease
 
 # --- The voltages by followed models, in real time and in one process alike.
 #

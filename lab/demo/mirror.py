@@ -16,14 +16,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.fleet.fleet import Fleet, FleetConfig
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.types import FloatArray
-from service.reports.plot_style import figure, label, legend, line, save
-from sim.mirror import Mirror, MirrorConfig, Wavefront
-from sim.signals.voltages import training_input
+from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.reports.plot_style import figure, label, legend, line, save
+from dehyst.sim.mirror import Mirror, MirrorConfig, Wavefront
+from dehyst.sim.signals.voltages import training_input
 
 WINDOW: Final = 60
 #: Voltage in the middle, V; amplifiers' limits, V; samples between two snapshots; ramp from rest, s.

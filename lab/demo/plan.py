@@ -21,16 +21,16 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.diagnosis.export import OFFSET
-from sim.effects import effect
-from sim.signals.references import demo_reference
-from sim.signals.voltages import training_input
-from sim.stage.config import StageConfig
-from sim.stage.file import load_stage, save_stage
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.export import OFFSET
+from dehyst.sim.effects import effect
+from dehyst.sim.signals.references import demo_reference
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.file import load_stage, save_stage
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 #: Served models in the order of the table, with their titles there.
 MODELS: dict[str, str] = {

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from lab.demo.plan import MODELS, Plan
-from service.reports.plot_style import figure, line, save
-from service.viewer.colours import EVENT, REFERENCE, model_colour
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.demo.plan import MODELS, Plan
+from dehyst.service.reports.plot_style import figure, line, save
+from dehyst.service.viewer.colours import EVENT, REFERENCE, model_colour
 
 # --- The result of a demonstration, live or fast, and its table and ``summary.json``.
 

@@ -13,33 +13,44 @@ from typing import Any, Final, cast
 import numpy as np
 import zenoh
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from lab.demo.controller import KEPT, FollowedModels
-from lab.demo.plan import AXIS, LOCK_STEP_S, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
-from lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
-from lab.loop import Asker, Twins, samples, turns
-from lab.testbed.identified_stage import READY_S, Rig, write_service_config
-from lab.testbed.processes import Child
-from service.client.client import Client
-from service.client.follower import Follower
-from service.config.settings import read_config
-from service.identification.identifying import NAMES, Stretch, identify_all
-from service.protocol import samples as wire
-from service.protocol.errors import ServiceError
-from service.protocol.keys import Keys
-from service.protocol.model import encode_model
-from service.runtime.session import SURELY, open_client, wait_followed
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.server.deltas import DeltaStreams
-from service.storage.model_file import BundleMeta, write_bundle
-from service.storage.output import clear_output
-from service.storage.recorder import Recorder, RecorderConfig
-from service.viewer.records import Diagnostics, Event, Record, SceneConfig, Tracking
-from service.viewer.rerun_sink import write_recording
-from sim.recordings import read, repaired
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.demo.controller import KEPT, FollowedModels
+from dehyst.lab.demo.plan import (
+    AXIS,
+    LOCK_STEP_S,
+    MODELS,
+    SNAPSHOT_EVERY,
+    STAGE,
+    TEACHER,
+    UNITS,
+    Plan,
+    make_plan,
+    plan_for,
+)
+from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
+from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.lab.testbed.identified_stage import READY_S, Rig, write_service_config
+from dehyst.lab.testbed.processes import Child
+from dehyst.service.client.client import Client
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.settings import read_config
+from dehyst.service.identification.identifying import NAMES, Stretch, identify_all
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import encode_model
+from dehyst.service.runtime.session import SURELY, open_client, wait_followed
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.server.deltas import DeltaStreams
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from dehyst.service.storage.output import clear_output
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
+from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Tracking
+from dehyst.service.viewer.rerun_sink import write_recording
+from dehyst.sim.recordings import read, repaired
+from dehyst.sim.stage.stage import Stage
 
 # --- In real time or slower: stage, service, controller, viewer stream and a bare paced loop as processes over zenoh.
 
@@ -109,7 +120,7 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         where = ["--endpoint", rig.endpoint, "--twins", ",".join(twins.values())]
         stage = rig.start_stage(STAGE, AXIS, *where, *_stage_options(plan, plan.ticks, changing=True))
         loop = rig.start_paced_loop(plan.dt_s, plan.ticks, wait=False)
-        program = ["-m", "lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
+        program = ["-m", "dehyst.lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
         controller = rig.start("controller", program, wait=False)
         _follow(controller, server, progress)
         if stage.wait(_OVERTIME_S) != 0:

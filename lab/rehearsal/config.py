@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from lab.rehearsal.reference import ReferenceMaker
-from service.config.settings import COMPETE
-from service.protocol.errors import FieldError
+from dehyst.lab.rehearsal.reference import ReferenceMaker
+from dehyst.service.config.settings import COMPETE
+from dehyst.service.protocol.errors import FieldError
 
 
 @dataclass(frozen=True, slots=True)

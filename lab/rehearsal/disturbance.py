@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray
-from lab.rehearsal.plant import Change, Changeable, Plant, run_checked
-from service.protocol.errors import FieldError
-from service.protocol.samples import MAX_SEQ, SampleBatch
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.rehearsal.plant import Change, Changeable, Plant, run_checked
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
 
 # --- The events of a rehearsal: one per run, at a known time, of a known size.
 #

@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.online.gates import GLITCH, UNTRUSTED
-from adaptive.types import BoolArray, FloatArray
-from lab.rehearsal.disturbance import SENSOR, Event
-from lab.rehearsal.runs import LoopRecord
-from service.answers.guard import Limits
-from service.reports.tables import json_form
-from sim.masks import runs
+from dehyst.adaptive.online.gates import GLITCH, UNTRUSTED
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.lab.rehearsal.disturbance import SENSOR, Event
+from dehyst.lab.rehearsal.runs import LoopRecord
+from dehyst.service.answers.guard import Limits
+from dehyst.service.reports.tables import json_form
+from dehyst.sim.masks import runs
 
 #: Window of the worst mean error, s; error that must not last, percent of the range.
 WINDOW_S: Final = 0.5

@@ -13,14 +13,14 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.types import FloatArray, InverseModel
-from baselines import fit_bouc_wen, fit_linear, fit_mpi
-from lab.rehearsal.config import RehearsalConfig
-from service.answers.guard import Limits
-from service.config.settings import LEARN
-from service.protocol.errors import FieldError
-from sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines import fit_bouc_wen, fit_linear, fit_mpi
+from dehyst.lab.rehearsal.config import RehearsalConfig
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import LEARN
+from dehyst.service.protocol.errors import FieldError
+from dehyst.sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
 
 # --- What a rehearsal accepts as a stage: an object or a function that turns a block of voltages into displacements.
 #

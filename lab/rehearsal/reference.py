@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.protocol.errors import FieldError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.errors import FieldError
 
 
 class Motion(NamedTuple):

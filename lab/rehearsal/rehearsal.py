@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from lab.rehearsal.config import RehearsalConfig
-from lab.rehearsal.disturbance import (
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.rehearsal.config import RehearsalConfig
+from dehyst.lab.rehearsal.disturbance import (
     REFERENCE,
     SENSOR,
     STANDARD,
@@ -26,7 +26,7 @@ from lab.rehearsal.disturbance import (
     MessageLine,
     draw,
 )
-from lab.rehearsal.outcome import (
+from dehyst.lab.rehearsal.outcome import (
     LARGE_PCT,
     SENSOR_FACTOR,
     SENSOR_PCT,
@@ -35,17 +35,17 @@ from lab.rehearsal.outcome import (
     healthy_outcome,
     outcome,
 )
-from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
-from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
-from lab.rehearsal.runs import LoopRecord, idle_samples, run_adaptive, run_frozen, times
-from service.config.settings import LEARN, AxisConfig
-from service.protocol.errors import FieldError
-from service.reports import tables
-from service.reports.plot_style import figure, legend, line, save
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
-from service.viewer.colours import ADAPTIVE, EVENT, FROZEN, TROUBLE
+from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
+from dehyst.lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
+from dehyst.lab.rehearsal.runs import LoopRecord, idle_samples, run_adaptive, run_frozen, times
+from dehyst.service.config.settings import LEARN, AxisConfig
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.reports import tables
+from dehyst.service.reports.plot_style import figure, legend, line, save
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.service.viewer.colours import ADAPTIVE, EVENT, FROZEN, TROUBLE
 
 #: Stage and axis name of the rehearsed axis.
 STAGE, AXIS = "rehearsal", "x"

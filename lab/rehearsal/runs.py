@@ -14,12 +14,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray, InverseModel
-from lab.loop import Asker, turns
-from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
-from lab.rehearsal.reference import Motion
-from service.answers.guard import Limits, guard
-from service.server.axis import Axis
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.lab.loop import Asker, turns
+from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
+from dehyst.lab.rehearsal.reference import Motion
+from dehyst.service.answers.guard import Limits, guard
+from dehyst.service.server.axis import Axis
 
 #: Called with the samples done.
 LoopProgress = Callable[[int], None]

@@ -4,7 +4,7 @@
 the report, the tables and the figures.
 """
 
-from lab.reproduce.measured import Study, StudyConfig, run_study
-from lab.reproduce.report import tables, write_study
+from dehyst.lab.reproduce.measured import Study, StudyConfig, run_study
+from dehyst.lab.reproduce.report import tables, write_study
 
 __all__ = ["Study", "StudyConfig", "run_study", "tables", "write_study"]

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from lab.reproduce.measured import WINDOWS, Benchmark, PresetStudy, Stack
-from service.reports.plot_style import figure, label, legend, line, save
-from service.viewer.colours import BEFORE, REFERENCE, SERIES, model_colour
-from sim.chapter.control import FROZEN, GAIN_CHANGE, LEARNING, Control, Loop, moving_mae
-from sim.chapter.experiments import Characterisation, Record, Width
-from sim.chapter.forward_lssvm import two_inputs
-from sim.chapter.modelling import ForwardRun
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.reproduce.measured import WINDOWS, Benchmark, PresetStudy, Stack
+from dehyst.service.reports.plot_style import figure, label, legend, line, save
+from dehyst.service.viewer.colours import BEFORE, REFERENCE, SERIES, model_colour
+from dehyst.sim.chapter.control import FROZEN, GAIN_CHANGE, LEARNING, Control, Loop, moving_mae
+from dehyst.sim.chapter.experiments import Characterisation, Record, Width
+from dehyst.sim.chapter.forward_lssvm import two_inputs
+from dehyst.sim.chapter.modelling import ForwardRun
 
 # Figs. 2.2, 2.3, 2.8 to 2.15: the stage's loops, and the forward models on training and test records.
 

@@ -11,18 +11,23 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.gates import AdmissionConfig
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray
-from baselines.bouc_wen.mechanical import MechanicalBoucWen, MechanicalReport, PeriodicRecord, identify_mechanical
-from service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
-from sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
-from sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
-from sim.chapter.modelling import ForwardRun, identify_forward
-from sim.recordings import ColumnMap, read, repaired
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.gates import AdmissionConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.mechanical import (
+    MechanicalBoucWen,
+    MechanicalReport,
+    PeriodicRecord,
+    identify_mechanical,
+)
+from dehyst.service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
+from dehyst.sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
+from dehyst.sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
+from dehyst.sim.chapter.modelling import ForwardRun, identify_forward
+from dehyst.sim.recordings import ColumnMap, read, repaired
 
 # --- The models on data from others: a measured stack actuator, and the Bouc-Wen benchmark.
 #

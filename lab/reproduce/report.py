@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.inverse_model import LssvmInverse
-from baselines.bouc_wen.model import BoucWenParameters
-from baselines.prandtl_ishlinskii.model import MpiParameters, inverse_thresholds, inverse_weights
-from lab.reproduce.figures import benchmark_figure, draw_control, draw_models, stack_figure
-from lab.reproduce.measured import BENCHMARK_PUBLISHED, WINDOWS, Benchmark, PresetStudy, Stack, Study
-from service.reports.tables import json_form, markdown
-from sim.chapter import published
-from sim.chapter.control import CHANGE_S, FROZEN, GAIN_CHANGE, LEARNING
-from sim.chapter.experiments import Width
-from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.baselines.bouc_wen.model import BoucWenParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters, inverse_thresholds, inverse_weights
+from dehyst.lab.reproduce.figures import benchmark_figure, draw_control, draw_models, stack_figure
+from dehyst.lab.reproduce.measured import BENCHMARK_PUBLISHED, WINDOWS, Benchmark, PresetStudy, Stack, Study
+from dehyst.service.reports.tables import json_form, markdown
+from dehyst.sim.chapter import published
+from dehyst.sim.chapter.control import CHANGE_S, FROZEN, GAIN_CHANGE, LEARNING
+from dehyst.sim.chapter.experiments import Width
+from dehyst.sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm
 
 # --- ``tables.json``: every number of the report, published and computed, and whether the targets are met.
 

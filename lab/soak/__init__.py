@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from lab.soak.fault_plan import FAULT_KINDS as FAULT_KINDS
-    from lab.soak.fault_plan import SoakPlan as SoakPlan
-    from lab.soak.fault_plan import make_plan as make_plan
-    from lab.soak.fault_plan import select_kinds as select_kinds
-    from lab.soak.session import run as run
+    from dehyst.lab.soak.fault_plan import FAULT_KINDS as FAULT_KINDS
+    from dehyst.lab.soak.fault_plan import SoakPlan as SoakPlan
+    from dehyst.lab.soak.fault_plan import make_plan as make_plan
+    from dehyst.lab.soak.fault_plan import select_kinds as select_kinds
+    from dehyst.lab.soak.session import run as run
 
 __getattr__ = lazy_names(__name__)

@@ -15,15 +15,15 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from lab.soak.controller import AXIS, SERVED, STAGE, dwell_key
-from lab.soak.fault_plan import PlannedFault
-from lab.soak.observed import Monitor
-from lab.soak.rig import SERVICES, SoakRig
-from lab.testbed.shifted_clock import write_offset
-from service.operating.remote import operate
-from service.protocol.keys import Keys
-from service.protocol.query import Trajectory, decode_reply, encode_query
-from service.stage_node.faults import DELIVERY, READING, fault_key
+from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, dwell_key
+from dehyst.lab.soak.fault_plan import PlannedFault
+from dehyst.lab.soak.observed import Monitor
+from dehyst.lab.soak.rig import SERVICES, SoakRig
+from dehyst.lab.testbed.shifted_clock import write_offset
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import Trajectory, decode_reply, encode_query
+from dehyst.service.stage_node.faults import DELIVERY, READING, fault_key
 
 #: Bytes that a process may still add to a file while the disk is full.
 _DISK_FULL_BYTES: Final = 4096

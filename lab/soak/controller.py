@@ -1,7 +1,7 @@
 """The controller of a soak as a process: it asks for voltages ahead of time and sends them until it is stopped.
 
-``python -m lab.soak.controller TASK.json ENDPOINT``. If no answer comes before a block is due, the stage holds its
-last voltage and the controller goes on with the next block.
+``python -m dehyst.lab.soak.controller TASK.json ENDPOINT``. If no answer comes before a block is due, the stage holds
+its last voltage and the controller goes on with the next block.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from lab.testbed.processes import run_client_process
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.errors import ServiceError
-from service.protocol.keys import Keys
-from service.protocol.query import Trajectory
-from service.runtime.session import open_client
-from service.runtime.stopping import StopSignal
-from service.security.authenticator import own_authenticator
-from service.security.lease import CommandLease
-from service.stage_node.node import status_key
-from sim.signals.references import DemoReference
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.testbed.processes import run_client_process
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import Trajectory
+from dehyst.service.runtime.session import open_client
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.security.lease import CommandLease
+from dehyst.service.stage_node.node import status_key
+from dehyst.sim.signals.references import DemoReference
 
 # --- The task of the soak's controller: keys, limits, and the reference.
 

@@ -1,8 +1,8 @@
 """Processes that disturb a soak: a slow subscriber, a busy core, and a client that sends malformed messages.
 
-``python -m lab.soak.disturbers slow|busy|malformed ENDPOINT BASE_KEY [SEED]`` prints ``ready`` and runs until it is
-stopped; BASE_KEY is that of the axis. The malformed client has the key, as a faulty program of the laboratory has: its
-samples are signed, and refused for what they are.
+``python -m dehyst.lab.soak.disturbers slow|busy|malformed ENDPOINT BASE_KEY [SEED]`` prints ``ready`` and runs until it
+is stopped; BASE_KEY is that of the axis. The malformed client has the key, as a faulty program of the laboratory has:
+its samples are signed, and refused for what they are.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from service.operating.verbs import MAX_BYTES
-from service.protocol.query import encode_query
-from service.protocol.samples import encode_reference, encode_samples
-from service.runtime.session import SURELY, open_client
-from service.runtime.stopping import StopSignal
-from service.security.authenticator import own_authenticator
+from dehyst.service.operating.verbs import MAX_BYTES
+from dehyst.service.protocol.query import encode_query
+from dehyst.service.protocol.samples import encode_reference, encode_samples
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.security.authenticator import own_authenticator
 
 #: Messages per second: many, but other clients must still get through.
 RATE_HZ: Final = 200.0

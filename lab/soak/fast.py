@@ -9,22 +9,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from lab.loop import Asker, turns
-from lab.soak.controller import AXIS, SERVED, STAGE, ControlTask, SoakReference
-from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, SoakPlan
-from lab.soak.judge import judge_sensor_fault, stage_gain
-from lab.soak.live import progress_line
-from lab.soak.observed import Counted, FaultRecord, Observations, SampleTracker, troubles_since
-from lab.testbed.identified_stage import SAMPLES_PER_MESSAGE
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.stage_node.faults import CHANGE, Fault, Injector
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.loop import Asker, turns
+from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, ControlTask, SoakReference
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, PlannedFault, SoakPlan
+from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
+from dehyst.lab.soak.live import progress_line
+from dehyst.lab.soak.observed import Counted, FaultRecord, Observations, SampleTracker, troubles_since
+from dehyst.lab.testbed.identified_stage import SAMPLES_PER_MESSAGE
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.stage_node.faults import CHANGE, Fault, Injector
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 
 _PROGRESS_S: Final = 5.0
 _CHANGES: Final = {"gain": "gain_drift.gain", "payload": "resonance.payload_ratio"}

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.errors import InputError
+from dehyst.adaptive.errors import InputError
 
 # --- Kinds of faults
 

@@ -15,10 +15,10 @@ from typing import Any, Final
 import numpy as np
 from pyarrow import parquet
 
-from adaptive.online.sensor_trust import SENSOR_FAULTS
-from adaptive.types import FloatArray
-from lab.soak.fault_plan import FAULT_KINDS
-from lab.soak.observed import (
+from dehyst.adaptive.online.sensor_trust import SENSOR_FAULTS
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.soak.fault_plan import FAULT_KINDS
+from dehyst.lab.soak.observed import (
     NUMBERS,
     ROUND_OFF,
     Counted,
@@ -30,9 +30,9 @@ from lab.soak.observed import (
     between,
     told_by,
 )
-from service.answers.which_model import SAMPLES_POISONED, SENSOR_FROZEN
-from service.storage.recorder import ASIDE
-from service.storage.segments import close_left_open, segments
+from dehyst.service.answers.which_model import SAMPLES_POISONED, SENSOR_FROZEN
+from dehyst.service.storage.recorder import ASIDE
+from dehyst.service.storage.segments import close_left_open, segments
 
 
 @dataclass(frozen=True, slots=True)

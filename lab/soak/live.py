@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from lab.soak.actions import FaultActions
-from lab.soak.controller import ControlTask
-from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, Schedule, SoakPlan
-from lab.soak.judge import judge_sensor_fault, stage_gain
-from lab.soak.observed import Counted, FaultRecord, Monitor, Observations, QuerySecond
-from lab.soak.rig import SERVICES, SoakRig
-from service.protocol.errors import ServiceError
-from sim.stage.config import StageConfig
+from dehyst.lab.soak.actions import FaultActions
+from dehyst.lab.soak.controller import ControlTask
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, PlannedFault, Schedule, SoakPlan
+from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
+from dehyst.lab.soak.observed import Counted, FaultRecord, Monitor, Observations, QuerySecond
+from dehyst.lab.soak.rig import SERVICES, SoakRig
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.sim.stage.config import StageConfig
 
 Say = Callable[[str], None]
 _TICK_S: Final = 0.02

@@ -21,16 +21,16 @@ import zenoh
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from lab.soak.controller import AXIS, STAGE, STRAY, ControlTask
-from lab.soak.fault_plan import FAULT_KINDS
-from service.operating.remote import statuses
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client
-from service.stage_node.faults import sound_key
-from service.stage_node.node import status_key
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.soak.controller import AXIS, STAGE, STRAY, ControlTask
+from dehyst.lab.soak.fault_plan import FAULT_KINDS
+from dehyst.service.operating.remote import statuses
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.stage_node.faults import sound_key
+from dehyst.service.stage_node.node import status_key
 
 T = TypeVar("T")
 

@@ -1,7 +1,7 @@
 """A measuring client of a soak as a process: it asks for one point after the other, and follows the model.
 
-``python -m lab.soak.prober TASK.json ENDPOINT`` prints a line of JSON every second: round trips in µs, the longest
-time without an answer, answers that broke a promise, and the age of the followed model at each query.
+``python -m dehyst.lab.soak.prober TASK.json ENDPOINT`` prints a line of JSON every second: round trips in µs, the
+longest time without an answer, answers that broke a promise, and the age of the followed model at each query.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from adaptive.errors import InputError
-from lab.soak.controller import AXIS, STAGE, ControlTask
-from lab.testbed.processes import run_client_process
-from service.client.client import Client
-from service.protocol.errors import ServiceError
-from service.protocol.query import Point
-from service.runtime.stopping import StopSignal
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.soak.controller import AXIS, STAGE, ControlTask
+from dehyst.lab.testbed.processes import run_client_process
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.query import Point
+from dehyst.service.runtime.stopping import StopSignal
 
 #: Pause between two queries, s; time after which a query counts as not answered and the next one is sent, s.
 PAUSE_S: Final = 0.01

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from lab.soak.fault_plan import FAULT_KINDS, MACHINE, PROCESS, STAGE, SoakPlan
-from lab.soak.judge import TRACKING_PCT, Invariant, memory_in_use
-from lab.soak.observed import FaultRecord, Observations
-from service.reports.plot_style import figure, save
-from service.reports.tables import markdown
-from service.storage.output import atomic_write
-from service.viewer.colours import ADAPTIVE, EVENT, LIMIT, SERIES, TROUBLE
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, MACHINE, PROCESS, STAGE, SoakPlan
+from dehyst.lab.soak.judge import TRACKING_PCT, Invariant, memory_in_use
+from dehyst.lab.soak.observed import FaultRecord, Observations
+from dehyst.service.reports.plot_style import figure, save
+from dehyst.service.reports.tables import markdown
+from dehyst.service.storage.output import atomic_write
+from dehyst.service.viewer.colours import ADAPTIVE, EVENT, LIMIT, SERIES, TROUBLE
 
 HELD, BROKEN = "held", "broken"
 

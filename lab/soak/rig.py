@@ -10,13 +10,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final
 
-from lab.soak.controller import AXIS, SERVED, STAGE, ControlTask
-from lab.testbed.identified_stage import Rig, identify_stage, write_service_config
-from lab.testbed.processes import Child
-from lab.testbed.shifted_clock import write_offset
-from sim.stage.config import StageConfig
-from sim.stage.file import load_stage, save_stage
-from sim.stage.presets import preset
+from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, ControlTask
+from dehyst.lab.testbed.identified_stage import Rig, identify_stage, write_service_config
+from dehyst.lab.testbed.processes import Child
+from dehyst.lab.testbed.shifted_clock import write_offset
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.file import load_stage, save_stage
+from dehyst.sim.stage.presets import preset
 
 #: Models of the service: the baseline that fits any stage, the fallback, and the model that is served.
 MODELS: Final = ("linear", "mpi", SERVED)
@@ -113,7 +113,7 @@ class SoakRig:
         self.start_stage()
         self.rig.wait_ready(*SERVICES, "viewer")
         for name in ("controller", "prober"):
-            program = ["-m", f"lab.soak.{name}", str(self._task_file), self.rig.endpoint]
+            program = ["-m", f"dehyst.lab.soak.{name}", str(self._task_file), self.rig.endpoint]
             self.rig.start(name, program, wait=False)
         self.rig.wait_ready("stage", "controller", "prober")
 
@@ -144,7 +144,7 @@ class SoakRig:
 
     def start_helper(self, module: str, name: str, what: str, *arguments: str) -> Child:
         """Start a process of this package's ``module`` and wait until it is ready."""
-        return self.rig.start(name, ["-m", f"lab.soak.{module}", what, self.rig.endpoint, *arguments])
+        return self.rig.start(name, ["-m", f"dehyst.lab.soak.{module}", what, self.rig.endpoint, *arguments])
 
     def take_folders_away(self, name: str, now_s: float) -> list[Path]:
         """Rename the folders of recordings of a service and remove those of its checkpoints; returns where the first

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from lab.soak.fast import run_fast
-from lab.soak.fault_plan import SoakPlan
-from lab.soak.judge import TRACKING_PCT, assess, judge, mean_error_pct, recorded, unrecordable
-from lab.soak.live import Say, run_live
-from lab.soak.observed import Monitor, Observations
-from lab.soak.report import draw, report, soak_summary, write_summary
-from lab.soak.rig import SERVICES, identify, stage_config
-from service.storage.output import clear_output
+from dehyst.lab.soak.fast import run_fast
+from dehyst.lab.soak.fault_plan import SoakPlan
+from dehyst.lab.soak.judge import TRACKING_PCT, assess, judge, mean_error_pct, recorded, unrecordable
+from dehyst.lab.soak.live import Say, run_live
+from dehyst.lab.soak.observed import Monitor, Observations
+from dehyst.lab.soak.report import draw, report, soak_summary, write_summary
+from dehyst.lab.soak.rig import SERVICES, identify, stage_config
+from dehyst.service.storage.output import clear_output
 
 #: Files and folders of a run. Those of an older run are removed first; other files stay.
 OURS: Final = ("soak.json", "report.md", "plan.json", "soak.png", "soak.rrd", "model.npz", "a", "b", "logs")

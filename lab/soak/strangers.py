@@ -1,8 +1,8 @@
 """Strangers to a service: processes on its network that do not have its key, and try to move it.
 
-``python -m lab.soak.strangers forge ENDPOINT SEED MODEL.npz`` answers whoever asks for the state with forged ones, and
-with some that it begins and never ends, and makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve, and tells
-again what the one that serves claims. Both ask for the state too, with signatures that they have seen. They
+``python -m dehyst.lab.soak.strangers forge ENDPOINT SEED MODEL.npz`` answers whoever asks for the state with forged
+ones, and with some that it begins and never ends, and makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve,
+and tells again what the one that serves claims. Both ask for the state too, with signatures that they have seen. They
 print ``ready``, run until they are stopped, and print JSON: how often they ``tried``, and how many ``states`` they were
 given.
 """
@@ -21,18 +21,18 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from adaptive.types import StateDict
-from lab.soak.controller import AXIS, SERVED, STAGE
-from lab.testbed.processes import run_client_process
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.failover.state_transfer import fetch_state, part_of
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client
-from service.runtime.stopping import StopSignal
-from service.security.authenticator import STAMP, TAG
-from service.server.axis_loading import load_axis
-from service.storage.checkpoint import CheckpointMeta, encode_checkpoint
+from dehyst.adaptive.types import StateDict
+from dehyst.lab.soak.controller import AXIS, SERVED, STAGE
+from dehyst.lab.testbed.processes import run_client_process
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.failover.state_transfer import fetch_state, part_of
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.security.authenticator import STAMP, TAG
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.checkpoint import CheckpointMeta, encode_checkpoint
 
 #: Pause between two attempts, s; longest wait for a state that is asked for, s.
 PAUSE_S: Final = 0.5

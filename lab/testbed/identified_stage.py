@@ -9,14 +9,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import InverseModel
-from lab.testbed.processes import Child, Children, free_port
-from service.identification.identifying import identify_one
-from service.storage.model_file import BundleMeta, write_bundle
-from sim.signals.voltages import training_input
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import InverseModel
+from dehyst.lab.testbed.processes import Child, Children, free_port
+from dehyst.service.identification.identifying import identify_one
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 
 #: Length of the identification signal, s, and size of the window of the models with one.
 IDENTIFY_S: Final = 10.0
@@ -79,7 +79,7 @@ def _toml(value: Any) -> str:
 # --- The processes of an experiment by name: they meet at one endpoint on loopback and end with the experiment.
 
 #: The command line interface as a module.
-_CLI: Final = ("-m", "lab.cli")
+_CLI: Final = ("-m", "dehyst.lab.cli")
 #: What a process prints when it is ready, and how long that may take, s.
 READY: Final = "ready"
 READY_S: Final = 60.0
@@ -137,7 +137,7 @@ class Rig:
         self, config: Path, *options: str, name: str = "serve", wall_clock: Path | None = None, wait: bool = True
     ) -> Child:
         """A service. ``wall_clock``: the file that shifts its wall clock, see `lab.testbed.shifted_clock`."""
-        program = _CLI if wall_clock is None else ("-m", "lab.testbed.shifted_clock", str(wall_clock))
+        program = _CLI if wall_clock is None else ("-m", "dehyst.lab.testbed.shifted_clock", str(wall_clock))
         return self.start(name, [*program, "serve", "--config", str(config), "--json", *options], ready="{", wait=wait)
 
     def start_stage(self, stage: str, axis: str, *options: str, name: str = "stage", wait: bool = True) -> Child:
@@ -155,8 +155,10 @@ class Rig:
     def start_echo(self, endpoint: str = "", *, wait: bool = True) -> Child:
         """A bare echo: it listens at ``endpoint``, or connects to the rig's own endpoint."""
         how = ["listen", endpoint] if endpoint else ["connect", self.endpoint]
-        return self.start("echo", ["-m", "lab.testbed.processes", "echo", *how], wait=wait)
+        return self.start("echo", ["-m", "dehyst.lab.testbed.processes", "echo", *how], wait=wait)
 
     def start_paced_loop(self, step_s: float, ticks: int, *, wait: bool = True) -> Child:
         """A bare paced loop, see `lab.testbed.processes`."""
-        return self.start("bare", ["-m", "lab.testbed.processes", "paced_loop", str(step_s), str(ticks)], wait=wait)
+        return self.start(
+            "bare", ["-m", "dehyst.lab.testbed.processes", "paced_loop", str(step_s), str(ticks)], wait=wait
+        )

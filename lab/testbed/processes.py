@@ -17,10 +17,10 @@ from typing import Any
 
 import zenoh
 
-from adaptive.errors import DehystError
-from service.protocol.errors import ServiceError
-from service.runtime.session import open_client, open_service
-from service.runtime.stopping import StopSignal, unbroken
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.runtime.stopping import StopSignal, unbroken
 
 
 def free_port() -> int:
@@ -180,7 +180,7 @@ class Children:
 
 # --- Processes that measure the machine beside an experiment: a bare zenoh echo and a bare paced loop.
 #
-# ``python -m lab.testbed.processes echo listen|connect ENDPOINT`` answers queries with as many bytes as asked
+# ``python -m dehyst.lab.testbed.processes echo listen|connect ENDPOINT`` answers queries with as many bytes as asked
 # for: the round trip without a service. ``... paced_loop STEP_S TICKS`` only sleeps from tick to tick: how late this
 # machine runs a process that asks for nothing else. Both print ``ready``; the echo runs until stopped.
 
@@ -193,7 +193,7 @@ def echo(how: str, endpoint: str) -> int:
 
     ``how``: ``listen`` opens ``endpoint``, ``connect`` connects to the router there.
     """
-    from service.server.process import tune_process
+    from dehyst.service.server.process import tune_process
 
     tune_process()
     stop = StopSignal()

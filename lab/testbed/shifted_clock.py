@@ -1,7 +1,7 @@
 """``dehyst`` with a wall clock that another process can set back.
 
-``python -m lab.testbed.shifted_clock FILE COMMAND ...`` adds the seconds in FILE (8 bytes, a double) to ``time.time``
-of this process. The system clock stays as it is: to set it needs rights that a test should not have.
+``python -m dehyst.lab.testbed.shifted_clock FILE COMMAND ...`` adds the seconds in FILE (8 bytes, a double) to
+``time.time`` of this process. The system clock stays as it is: to set it needs rights that a test should not have.
 """
 
 from __future__ import annotations
@@ -39,6 +39,6 @@ def patch_clock(path: Path) -> None:
 
 if __name__ == "__main__":
     patch_clock(Path(sys.argv[1]))
-    from lab.cli import main
+    from dehyst.lab.cli import main
 
     sys.exit(main(sys.argv[2:]))

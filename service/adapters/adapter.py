@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from adaptive.errors import DehystError
-from service.protocol.errors import FieldError
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.protocol.errors import FieldError
 
 
 class AdapterError(DehystError):

@@ -24,15 +24,15 @@ from typing import Any, Final
 
 import zenoh
 
-from adaptive.errors import DehystError
-from service.adapters.adapter import load_library
-from service.cli.options import add_connection, add_epilog, add_shared
-from service.operating.remote import operate, statuses
-from service.protocol.errors import FieldError, ServiceError
-from service.protocol.keys import AUTO, Keys
-from service.runtime.session import is_loopback, open_client
-from service.runtime.stopping import StopSignal
-from service.security.authenticator import own_authenticator
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.adapters.adapter import load_library
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.operating.remote import operate, statuses
+from dehyst.service.protocol.errors import FieldError, ServiceError
+from dehyst.service.protocol.keys import AUTO, Keys
+from dehyst.service.runtime.session import is_loopback, open_client
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.security.authenticator import own_authenticator
 
 EPILOG = """\
 The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.

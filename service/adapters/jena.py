@@ -14,7 +14,7 @@ from collections.abc import Coroutine
 from types import TracebackType
 from typing import Any
 
-from service.adapters.adapter import AdapterError, check_rate, load_library
+from dehyst.service.adapters.adapter import AdapterError, check_rate, load_library
 
 
 class Nv200Stage:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Any
 
-from service.adapters.adapter import AdapterError, check_rate, load_library
-from service.protocol.errors import FieldError
+from dehyst.service.adapters.adapter import AdapterError, check_rate, load_library
+from dehyst.service.protocol.errors import FieldError
 
 
 class NiStage:

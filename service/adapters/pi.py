@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from service.adapters.adapter import AdapterError, Stated, check_rate, load_library
+from dehyst.service.adapters.adapter import AdapterError, Stated, check_rate, load_library
 
 _PORT = 50_000
 

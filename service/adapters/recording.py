@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.types import FloatArray
-from service.adapters.adapter import StageAdapter, Ticks, asked, check_range
-from service.protocol.errors import FieldError
-from service.protocol.samples import check_finite
-from service.storage.output import atomic_write
-from sim.signals.voltages import training_input
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.adapters.adapter import StageAdapter, Ticks, asked, check_range
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import check_finite
+from dehyst.service.storage.output import atomic_write
+from dehyst.sim.signals.voltages import training_input
 
 #: Time of the ramp from the present voltage to the first of a recording, s.
 RAMP_S = 1.0

@@ -1,8 +1,9 @@
 """A simulated PI controller: answers GCS commands over TCP as a piezo controller does, with a simulated stage behind.
 
-    python -m service.adapters.simulated_pi                      # at 127.0.0.1, port 50000; Ctrl-C ends it
-    python -m service.adapters.simulated_pi --gain-drop 60:0.06  # the gain drops by 6 % after 60 s of motion
-    python -m service.adapters.simulated_pi --fault sign         # one of the faults that `dehyst commission` names
+    python -m dehyst.service.adapters.simulated_pi                      # at 127.0.0.1, port 50000; Ctrl-C ends it
+    python -m dehyst.service.adapters.simulated_pi --gain-drop 60:0.06  # the gain drops by 6 % after 60 s of motion
+    python -m dehyst.service.adapters.simulated_pi --fault sign         # one of the faults that `dehyst commission`
+    names
 
 For the tutorial and the tests of `service.adapters.pi`. The stage is the preset ``rich`` behind an amplifier of 10 V/V:
 89 µm for 0 to 80 V, with 12 % hysteresis, creep, a mode at 450 Hz, drift and 5 nm of noise. It moves in real time.
@@ -22,8 +23,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 IDENTITY: Final = "simulated, E-709.CRG, 0, 1.0"
 #: Error codes of GCS.

@@ -12,12 +12,12 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray
-from service.adapters.adapter import AdapterError, StageAdapter, Ticks, asked, check_range
-from service.answers.guard import limit_voltage
-from service.client.client import Client
-from service.protocol.errors import FieldError
-from service.stage_node.exchange import RING_SIZE, CommandBuffer, Sender, next_message
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.adapters.adapter import AdapterError, StageAdapter, Ticks, asked, check_range
+from dehyst.service.answers.guard import limit_voltage
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.stage_node.exchange import RING_SIZE, CommandBuffer, Sender, next_message
 
 #: (sample number, reading at that instant, µm) -> voltage from that instant on, V.
 Control = Callable[[int, float], float]

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.answers.answering import MemoryTracker as MemoryTracker
-    from service.answers.answering import Served as Served
-    from service.answers.answering import answer as answer
-    from service.answers.answering import derivatives as derivatives
-    from service.answers.fallback import Rules as Rules
-    from service.answers.fallback import answer_safely as answer_safely
-    from service.answers.guard import Limits as Limits
-    from service.answers.which_model import Answering as Answering
-    from service.answers.which_model import trust_by_age as trust_by_age
+    from dehyst.service.answers.answering import MemoryTracker as MemoryTracker
+    from dehyst.service.answers.answering import Served as Served
+    from dehyst.service.answers.answering import answer as answer
+    from dehyst.service.answers.answering import derivatives as derivatives
+    from dehyst.service.answers.fallback import Rules as Rules
+    from dehyst.service.answers.fallback import answer_safely as answer_safely
+    from dehyst.service.answers.guard import Limits as Limits
+    from dehyst.service.answers.which_model import Answering as Answering
+    from dehyst.service.answers.which_model import trust_by_age as trust_by_age
 
 __getattr__ = lazy_names(__name__)

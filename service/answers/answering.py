@@ -13,20 +13,20 @@ from typing import Annotated, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.compiled import all_finite
-from adaptive.state import Entry
-from adaptive.types import FloatArray, InverseModel
-from baselines.competition.champion import ChampionInverse
-from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits, check_domain
-from service.answers.slices import Pace
-from service.answers.which_model import trust_by_age
-from service.config.settings import AxisConfig
-from service.protocol.errors import FieldError
-from service.protocol.keys import AUTO
-from service.protocol.model import StandIn
-from service.protocol.query import MAX_PENDING, NEWEST, FeedforwardQuery, Pending, Trajectory
-from service.protocol.samples import MAX_SEQ, check_finite, column
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.fallback import Rules, answer_safely
+from dehyst.service.answers.guard import Limits, check_domain
+from dehyst.service.answers.slices import Pace
+from dehyst.service.answers.which_model import trust_by_age
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import AUTO
+from dehyst.service.protocol.model import StandIn
+from dehyst.service.protocol.query import MAX_PENDING, NEWEST, FeedforwardQuery, Pending, Trajectory
+from dehyst.service.protocol.samples import MAX_SEQ, check_finite, column
 
 # --- The hysteresis memory that the service tracks from measured samples, for queries that bring none.
 

@@ -16,13 +16,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.compiled import all_finite
-from adaptive.types import Feedforward, FloatArray, InverseModel
-from service.answers.guard import Limits, guard, guarded
-from service.answers.slices import Pace, in_slices
-from service.answers.which_model import domain_weight, log_model_error
-from service.protocol.model import StandIn
-from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel
+from dehyst.service.answers.guard import Limits, guard, guarded
+from dehyst.service.answers.slices import Pace, in_slices
+from dehyst.service.answers.which_model import domain_weight, log_model_error
+from dehyst.service.protocol.model import StandIn
+from dehyst.service.protocol.query import (
+    BLENDED,
+    NOT_FINITE_REPLACED,
+    OUTSIDE_DOMAIN,
+    STALE,
+    STAND_IN,
+    Answer,
+    Trajectory,
+)
 
 # --- Answers with a stand-in.
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.compiled import compiled
-from adaptive.types import BoolArray, FloatArray
-from service.protocol.errors import FieldError
-from service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
-from baselines.competition.champion import ChampionInverse
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
+from dehyst.baselines.competition.champion import ChampionInverse
 
 #: Points of a slice: half a millisecond with a window of 500.
 SLICE: Final = 256

@@ -9,7 +9,7 @@ Three questions, in this order:
 3. What is that called? `answering`, by `ROWS`: the first row that holds.
 
 All are functions of samples, snapshots and queries alone: a standby, a replay and a follower decide alike.
-``python -m service.answers.which_model`` prints the page ``docs/which_model.md``.
+``python -m dehyst.service.answers.which_model`` prints the page ``docs/which_model.md``.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
-from adaptive.state import Entry
-from adaptive.types import Feedforward, FloatArray, InverseModel
-from baselines.competition.champion import ChampionInverse
-from service.answers.guard import Limits
-from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STAND_IN
+from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.guard import Limits
+from dehyst.service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STAND_IN
 
 
 class Answering(StrEnum):
@@ -406,7 +406,7 @@ _PAGE: Final = """\
 
 The field `answering` of the [status](protocol.md#status), the metric `dehyst_answering`, `Follower.answering` and the
 text of the event `trouble` say it by one word. The decisions are in `service/answers/which_model.py`. This page is
-generated: `python -m service.answers.which_model > docs/which_model.md`.
+generated: `python -m dehyst.service.answers.which_model > docs/which_model.md`.
 
 | `answering` | what answers where a query names no model |
 |---|---|

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.background.job import BackgroundJob as BackgroundJob
-    from service.background.job import run_worker as run_worker
-    from service.background.job import step_back as step_back
-    from service.background.retuner import Adoptions as Adoptions
-    from service.background.retuner import Retuned as Retuned
-    from service.background.retuner import Retuner as Retuner
-    from service.background.settings import RetuningConfig as RetuningConfig
-    from service.background.settings import WatchConfig as WatchConfig
-    from service.background.watcher import Watcher as Watcher
+    from dehyst.service.background.job import BackgroundJob as BackgroundJob
+    from dehyst.service.background.job import run_worker as run_worker
+    from dehyst.service.background.job import step_back as step_back
+    from dehyst.service.background.retuner import Adoptions as Adoptions
+    from dehyst.service.background.retuner import Retuned as Retuned
+    from dehyst.service.background.retuner import Retuner as Retuner
+    from dehyst.service.background.settings import RetuningConfig as RetuningConfig
+    from dehyst.service.background.settings import WatchConfig as WatchConfig
+    from dehyst.service.background.watcher import Watcher as Watcher
 
 __getattr__ = lazy_names(__name__)

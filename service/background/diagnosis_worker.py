@@ -1,4 +1,7 @@
-"""The process that diagnoses (see `service.background.job`): ``-m service.background.diagnosis_worker FOLDER``."""
+"""The process that diagnoses (see `service.background.job`).
+
+``python -m dehyst.service.background.diagnosis_worker FOLDER``.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from service.background.job import run_worker
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.service.background.job import run_worker
 
 
 def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
-    from sim.changes import TooFewSamples
+    from dehyst.sim.changes import TooFewSamples
 
     try:
         return diagnose(job, arrays["reference"], arrays["recent"])
@@ -28,8 +31,8 @@ def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> 
     ``job`` holds ``model`` (model file), ``name`` (of the model in it), ``from_seq`` (first recent sample) and
     ``report`` (folder for a full report, or empty). Raises InputError and ModelFileError.
     """
-    from service.storage.model_file import read_bundle
-    from sim.changes import compare
+    from dehyst.service.storage.model_file import read_bundle
+    from dehyst.sim.changes import compare
 
     bundle = read_bundle(job["model"])
     model = bundle.models[job["name"]]
@@ -46,8 +49,8 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
 
     A long gap splits the samples: then the part with most samples from ``from_seq`` on is taken.
     """
-    from adaptive.smoothing import SmootherConfig, smooth_recording
-    from sim.changes import Stretch
+    from dehyst.adaptive.smoothing import SmootherConfig, smooth_recording
+    from dehyst.sim.changes import Stretch
 
     first = int(np.searchsorted(samples[0], from_seq))
     whole, valid = _repaired(samples, dt_s, first)
@@ -61,7 +64,7 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
 
 
 def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, BoolArray]:
-    from sim.recordings import Recording, repaired
+    from dehyst.sim.recordings import Recording, repaired
 
     # Sample numbers give the time, as in the learner: the clock of the stage may have been set.
     recording = Recording(
@@ -74,9 +77,9 @@ def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, Bo
 
 def full_report(out: Path, samples: FloatArray, dt_s: float) -> dict[str, Any]:
     """The diagnosis of the recent samples as measured data, with its report in the folder ``out``."""
-    from service.reports.diagnosis import Source, write_report
-    from sim.diagnosis.diagnose import diagnose_prepared
-    from sim.diagnosis.prepare import prepare
+    from dehyst.service.reports.diagnosis import Source, write_report
+    from dehyst.sim.diagnosis.diagnose import diagnose_prepared
+    from dehyst.sim.diagnosis.prepare import prepare
 
     recording, _ = _repaired(samples, dt_s)
     prepared = prepare(recording)

@@ -20,9 +20,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import DehystError
-from adaptive.types import FloatArray
-from service.storage.output import atomic_write
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.storage.output import atomic_write
 
 # --- Priority of processes: background jobs run at low priority, behind the process that answers queries.
 

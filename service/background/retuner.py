@@ -18,12 +18,12 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import Hyperparameters, OnlineModel, WindowData
-from service.background.job import BackgroundJob
-from service.background.retuning_worker import pack, start_job
-from service.background.settings import RetuningConfig
-from service.protocol.errors import FieldError
-from service.storage.output import append_line
+from dehyst.adaptive.types import Hyperparameters, OnlineModel, WindowData
+from dehyst.service.background.job import BackgroundJob
+from dehyst.service.background.retuning_worker import pack, start_job
+from dehyst.service.background.settings import RetuningConfig
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.storage.output import append_line
 
 # --- Adoptions of hyper-parameters, each at a definite sample: announced, stored, read and applied.
 #

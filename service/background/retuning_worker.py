@@ -1,4 +1,5 @@
-"""The process that tunes, ``python -m service.background.retuning_worker FOLDER``, and how the service starts it.
+"""The process that tunes, ``python -m dehyst.service.background.retuning_worker FOLDER``, and how the service starts
+it.
 
 `start_job` and `pack` are the side of the service, `tuned` is the work of the process (see `service.background.job`).
 """
@@ -12,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray, Hyperparameters, WindowData
-from service.background.job import BackgroundJob, run_worker
+from dehyst.adaptive.types import FloatArray, Hyperparameters, WindowData
+from dehyst.service.background.job import BackgroundJob, run_worker
 
 
 def start_job(order: dict[str, Any], arrays: dict[str, FloatArray], timeout_s: float) -> BackgroundJob:
     """Start the process with an ``order`` and the windows in ``arrays`` (see `tuned` and `pack`)."""
-    job = BackgroundJob("service.background.retuning_worker", order, arrays, timeout_s)
+    job = BackgroundJob("dehyst.service.background.retuning_worker", order, arrays, timeout_s)
     job.start()
     return job
 
@@ -43,8 +44,8 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     ``order`` is ``{"kind": "propose", "search": {...}, "torch": bool}`` for the window ``before`` in the arrays, or
     ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` for ``before`` and ``after``. Raises DehystError.
     """
-    from adaptive.tuning.config import RetuneConfig
-    from adaptive.tuning.retuning import compare, propose
+    from dehyst.adaptive.tuning.config import RetuneConfig
+    from dehyst.adaptive.tuning.retuning import compare, propose
 
     data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}
     ranges = {name: tuple(order["search"][name]) for name in ("gamma_range", "width_range")}
@@ -69,8 +70,8 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
 def _search(wanted: bool) -> tuple[Any, str]:
     """(search for starting points, its name): the batch search with torch if it is wanted and installed."""
     if wanted:
-        from baselines.swarm.evidence_search import EvidenceSearch
-        from baselines.swarm.identification import MissingTorchError, torch_module
+        from dehyst.baselines.swarm.evidence_search import EvidenceSearch
+        from dehyst.baselines.swarm.identification import MissingTorchError, torch_module
 
         try:
             torch_module().set_num_threads(1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from adaptive.errors import InputError
-from adaptive.tuning.config import RetuneConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.tuning.config import RetuneConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,13 +15,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray
-from service.background.job import BackgroundJob
-from service.background.settings import WatchConfig
-from service.protocol.errors import FieldError
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.background.job import BackgroundJob
+from dehyst.service.background.settings import WatchConfig
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
 
 # --- The newest samples of one axis in a ring buffer of fixed size. One thread writes; any thread may copy.
 
@@ -174,7 +174,7 @@ _TOLD: Final = ("job", "seq", "why", "text")
 #: Least motion in a reference, as a share of the range of the axis.
 _LEAST_MOTION: Final = 0.05
 #: Module of the process.
-WORKER: Final = "service.background.diagnosis_worker"
+WORKER: Final = "dehyst.service.background.diagnosis_worker"
 _ARGUMENTS: Final = ("recent_s", "report")
 
 

@@ -1,7 +1,7 @@
-"""``python -m service.cli``: the commands of the service alone."""
+"""``python -m dehyst.service.cli``: the commands of the service alone."""
 
 import sys
 
-from service.cli.main import main
+from dehyst.service.cli.main import main
 
 sys.exit(main())

@@ -14,8 +14,8 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from typing import Any, Final, NamedTuple
 
-from adaptive.errors import DehystError
-from service.runtime.descriptors import too_many
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.runtime.descriptors import too_many
 
 # --- Which packages a command needs beyond those of the client, and the extra of the installation that brings them.
 
@@ -93,7 +93,7 @@ class Command(NamedTuple):
 
 
 def _command(module: str, group: str, help_line: str, *extras: str, compiles: bool = False) -> Command:
-    return Command(f"service.cli.commands.{module}", group, help_line, extras, compiles)
+    return Command(f"dehyst.service.cli.commands.{module}", group, help_line, extras, compiles)
 
 
 #: The commands that need nothing but the service. `lab.cli` adds the experiments.
@@ -116,12 +116,14 @@ COMMANDS: Final[dict[str, Command]] = {
     "ask-diagnosis": _command(
         "operate", OPERATING, "let a running service diagnose its recent samples, in the background"
     ),
-    "epics": Command("service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"),
+    "epics": Command(
+        "dehyst.service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"
+    ),
     "access": _command(
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),
     "commission": Command(
-        "service.commissioning.command",
+        "dehyst.service.commissioning.command",
         IDENTIFICATION,
         "move a stage through its adapter, and identify it",
         (SERVE,),
@@ -131,7 +133,9 @@ COMMANDS: Final[dict[str, Command]] = {
         "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
     ),
     "export": Command(
-        "service.export.command", IDENTIFICATION, "write a model as C, tables and an FMU, for use without the service"
+        "dehyst.service.export.command",
+        IDENTIFICATION,
+        "write a model as C, tables and an FMU, for use without the service",
     ),
     "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
     "replay": _command(
@@ -220,13 +224,13 @@ def _run(args: list[str], commands: Mapping[str, Command]) -> int:
             f"COMMAND: got {chosen!r}; {meant}expected one of {', '.join(commands)}; options follow the command"
         )
     parsed = parser.parse_args(args, argparse.Namespace(given=args))
-    from service.runtime.logging_setup import set_up_logging
+    from dehyst.service.runtime.logging_setup import set_up_logging
 
     set_up_logging(parsed.log_level)
     if key := vars(parsed).get("key"):
         os.environ["DEHYST_KEY"] = key  # for whatever this command starts, too
     if commands[parsed.command].compiles:
-        from service.warm import at_first_use
+        from dehyst.service.warm import at_first_use
 
         at_first_use()
     try:
@@ -266,7 +270,7 @@ def build_parser(commands: Mapping[str, Command], loaded: Collection[str]) -> ar
 
 
 def _load(entry: Command, parser: argparse.ArgumentParser, commands: Mapping[str, Command]) -> None:
-    from service.cli.options import add_shared
+    from dehyst.service.cli.options import add_shared
 
     module = importlib.import_module(entry.module)
     module.add_arguments(parser)

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from service.protocol.errors import FieldError
-from service.protocol.keys import check_name
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import check_name
 
 #: The note below examples that name files.
 EXAMPLE_FILES: Final = "'dehyst stage --examples DIR' makes a folder with the files that these examples name.\n"
@@ -64,7 +64,7 @@ def add_shared(parser: Any, *names: str, **changes: Mapping[str, Any]) -> None:
 
 def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1.0) -> None:
     """The options of a client: ``--endpoint --wait --zenoh-config --key``, and ``--timeout`` unless it is None."""
-    from service.runtime.session import DEFAULT_ENDPOINT
+    from dehyst.service.runtime.session import DEFAULT_ENDPOINT
 
     parser.add_argument(
         "--endpoint",

@@ -6,8 +6,8 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from adaptive.errors import DehystError
-from service.protocol.errors import FieldError
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.protocol.errors import FieldError
 
 
 def load_object(option: str, where: str, example: str) -> object:

@@ -27,13 +27,13 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.errors import DehystError
-from adaptive.types import FloatArray
-from service.answers.answering import derivatives
-from service.answers.guard import Limits, guard, limit_voltage
-from service.client.correcting import Correcting
-from service.client.follower import Follower
-from service.protocol.errors import (
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.answers.answering import derivatives
+from dehyst.service.answers.guard import Limits, guard, limit_voltage
+from dehyst.service.client.correcting import Correcting
+from dehyst.service.client.follower import Follower
+from dehyst.service.protocol.errors import (
     BehindError,
     BusyError,
     FieldError,
@@ -43,9 +43,18 @@ from service.protocol.errors import (
     UnsignedReplyError,
     error_from_json,
 )
-from service.protocol.keys import AUTO, Keys
-from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
-from service.protocol.samples import (
+from dehyst.service.protocol.keys import AUTO, Keys
+from dehyst.service.protocol.query import (
+    MAX_PENDING,
+    NEWEST,
+    Answer,
+    Pending,
+    Point,
+    Trajectory,
+    decode_reply,
+    encode_query,
+)
+from dehyst.service.protocol.samples import (
     check_finite,
     check_seq,
     column,
@@ -55,9 +64,9 @@ from service.protocol.samples import (
     number,
     waiting_time,
 )
-from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
-from service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
-from service.security.lease import CommandGate, CommandLease
+from dehyst.service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
+from dehyst.service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
+from dehyst.service.security.lease import CommandGate, CommandLease
 
 # --- How a query continues from the answer before it: its memory, its last voltage, and what is under way.
 #

@@ -11,14 +11,14 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.correction.integral import Correction, sensitivity
-from adaptive.correction.repetition import Repetition
-from adaptive.types import FloatArray, InverseModel
-from service.answers.guard import Limits
-from service.config.correction import CorrectionConfig, RepetitionConfig
-from service.config.schema import build_settings, keys_of
-from service.protocol.errors import FieldError
-from service.protocol.samples import column, sequence
+from dehyst.adaptive.correction.integral import Correction, sensitivity
+from dehyst.adaptive.correction.repetition import Repetition
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.service.config.schema import build_settings, keys_of
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import column, sequence
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
 #: Displacement, µm, velocity, µm/s, and acceleration, µm/s², (n,) each.

@@ -19,19 +19,19 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.errors import DehystError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, InverseModel
-from baselines.competition.champion import ChampionInverse
-from service.answers.answering import begin_from, derivatives
-from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
-from service.answers.guard import Limits, check_domain, guard, limit_voltage
-from service.answers.which_model import Answering, answering, seen_in, trust_by_age
-from service.client.correcting import Answer, Correcting, Motion
-from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
-from service.protocol.errors import FieldError
-from service.protocol.model import ModelMessage, decode_model
-from service.protocol.query import (
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.answering import begin_from, derivatives
+from dehyst.service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
+from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
+from dehyst.service.answers.which_model import Answering, answering, seen_in, trust_by_age
+from dehyst.service.client.correcting import Answer, Correcting, Motion
+from dehyst.service.protocol.delta import DeltaMessage, FollowedState, decode_delta
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.model import ModelMessage, decode_model
+from dehyst.service.protocol.query import (
     BLENDED,
     NEWEST,
     NOT_FINITE_REPLACED,
@@ -41,8 +41,8 @@ from service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
-from service.protocol.samples import check_seq, column, number, sequence, waiting_time
-from service.security.authenticator import NO_KEY, Heard
+from dehyst.service.protocol.samples import check_seq, column, number, sequence, waiting_time
+from dehyst.service.security.authenticator import NO_KEY, Heard
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
 #: Voltage below which what fades has faded, V.

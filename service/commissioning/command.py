@@ -8,10 +8,10 @@ import math
 import sys
 from typing import Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.cli.python_file import load_object
-from service.protocol.errors import FieldError
-from service.protocol.keys import check_name
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.python_file import load_object
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import check_name
 
 EPILOG = """\
 THE STAGE MOVES over the stated voltages: make sure that nothing is in its way. FILE.py:NAME is a function without
@@ -45,10 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Commission. Returns 0 if the target is met, 130 if stopped by a signal, else 1."""
-    from service.answers.guard import Limits
-    from service.commissioning.commission import commission
-    from service.commissioning.mover import Order
-    from service.runtime.stopping import StopSignal
+    from dehyst.service.answers.guard import Limits
+    from dehyst.service.commissioning.commission import commission
+    from dehyst.service.commissioning.mover import Order
+    from dehyst.service.runtime.stopping import StopSignal
 
     check_name("--stage", args.stage)
     check_name("--axis", args.axis)

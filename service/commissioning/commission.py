@@ -23,15 +23,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import DehystError
-from adaptive.types import FloatArray
-from service.adapters.adapter import StageAdapter
-from service.adapters.recording import StageRecording, excitation, write_recording
-from service.answers.guard import Limits
-from service.commissioning.mover import Following, Mover, Order, Piece, StageFault
-from service.commissioning.probe import Probed, probe, ramps
-from service.storage.output import atomic_write, check_folder, clear_output
-from sim.signals.voltages import generalisation_input
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.adapters.adapter import StageAdapter
+from dehyst.service.adapters.recording import StageRecording, excitation, write_recording
+from dehyst.service.answers.guard import Limits
+from dehyst.service.commissioning.mover import Following, Mover, Order, Piece, StageFault
+from dehyst.service.commissioning.probe import Probed, probe, ramps
+from dehyst.service.storage.output import atomic_write, check_folder, clear_output
+from dehyst.sim.signals.voltages import generalisation_input
 
 #: Names of the files.
 RECORDING, MODEL, CONFIGURATION, REPORT = FILES = ("recording.csv", "stage.npz", "serve.toml", "report.json")
@@ -103,7 +103,7 @@ class _Identification:
     def __init__(self, recording: Path, model: Path, holdout: float, order: Order) -> None:
         self._process = subprocess.Popen(
             [
-                sys.executable, "-m", "service.cli", "identify", str(recording), "--out", str(model), "--json",
+                sys.executable, "-m", "dehyst.service.cli", "identify", str(recording), "--out", str(model), "--json",
                 "--quiet", "--no-pictures", "--holdout", f"{holdout:.6f}", "--stage", order.stage, "--axis", order.axis,
             ],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,

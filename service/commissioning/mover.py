@@ -12,11 +12,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import DehystError
-from adaptive.types import BoolArray, FloatArray
-from service.adapters.adapter import StageAdapter, Tick, Ticks, asked, check_range
-from service.answers.guard import Limits, limit_voltage
-from service.protocol.errors import FieldError
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.service.adapters.adapter import StageAdapter, Tick, Ticks, asked, check_range
+from dehyst.service.answers.guard import Limits, limit_voltage
+from dehyst.service.protocol.errors import FieldError
 
 #: Standard errors that motion is seen by.
 SEEN: Final = 8.0

@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.adapters.adapter import Stated, StatesAxis, asked, check_range
-from service.commissioning.mover import SEEN, WAY_S, WAY_SHARE, Following, Mover, Order, Piece, StageFault
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.adapters.adapter import Stated, StatesAxis, asked, check_range
+from dehyst.service.commissioning.mover import SEEN, WAY_S, WAY_SHARE, Following, Mover, Order, Piece, StageFault
 
 #: First pulse, V, and factors by which pulses grow before and after motion is seen.
 START_V: Final = 0.005

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.config.learner import LearnerSettings as LearnerSettings
-    from service.config.learner import read_learner_settings as read_learner_settings
-    from service.config.schema import Setting as Setting
-    from service.config.schema import build_settings as build_settings
-    from service.config.settings import AxisConfig as AxisConfig
-    from service.config.settings import ServeConfig as ServeConfig
-    from service.config.settings import parse_config as parse_config
-    from service.config.settings import read_config as read_config
+    from dehyst.service.config.learner import LearnerSettings as LearnerSettings
+    from dehyst.service.config.learner import read_learner_settings as read_learner_settings
+    from dehyst.service.config.schema import Setting as Setting
+    from dehyst.service.config.schema import build_settings as build_settings
+    from dehyst.service.config.settings import AxisConfig as AxisConfig
+    from dehyst.service.config.settings import ServeConfig as ServeConfig
+    from dehyst.service.config.settings import parse_config as parse_config
+    from dehyst.service.config.settings import read_config as read_config
 
 __getattr__ = lazy_names(__name__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from service.config.schema import Setting
+from dehyst.service.config.schema import Setting
 
 _MODE = Setting(
     help="lowest frequency at which the stage rings ('dehyst modes'), with the heaviest payload",

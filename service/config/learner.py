@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptive.online.config import LearnerConfig
-from service.answers.guard import Limits
-from service.config.schema import build_settings, parse_toml, read_text
-from service.config.settings import AxisConfig, parse_config
-from service.protocol.errors import FieldError
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.schema import build_settings, parse_toml, read_text
+from dehyst.service.config.settings import AxisConfig, parse_config
+from dehyst.service.protocol.errors import FieldError
 
 
 @dataclass(frozen=True, slots=True)

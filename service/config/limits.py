@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.config.schema import Setting
+from dehyst.service.config.schema import Setting
 
 
 def limits_setting(help_text: str, lowest: str, highest: str) -> Setting:

@@ -1,6 +1,6 @@
 """What the schema of the configuration says, for people: the example file and the reference page.
 
-``python -m service.config.reference`` prints the page, which is ``docs/configuration.md``.
+``python -m dehyst.service.config.reference`` prints the page, which is ``docs/configuration.md``.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin
 
-from baselines.competition.config import CompetitionConfig
-from service.background.settings import RetuningConfig, WatchConfig
-from service.config.correction import CorrectionConfig, RepetitionConfig
-from service.config.schema import Key, inline_keys, keys_of
-from service.config.settings import AxisConfig, ServeConfig
-from service.fleet.settings import FleetSettings
+from dehyst.baselines.competition.config import CompetitionConfig
+from dehyst.service.background.settings import RetuningConfig, WatchConfig
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.service.config.schema import Key, inline_keys, keys_of
+from dehyst.service.config.settings import AxisConfig, ServeConfig
+from dehyst.service.fleet.settings import FleetSettings
 
 _HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
 _WIDTH = 36
@@ -30,7 +30,7 @@ _TITLE = """\
 
 One TOML file. `dehyst serve --example` prints one with every key of the first two tables. A key that is not listed here
 is an error. Relative paths are relative to the folder of the file. This page is generated from the schema:
-`python -m service.config.reference > docs/configuration.md`.
+`python -m dehyst.service.config.reference > docs/configuration.md`.
 """
 
 
@@ -45,7 +45,7 @@ def example() -> str:
 
 def tables() -> tuple[tuple[str, type], ...]:
     """The tables of the file: title on the page, and schema."""
-    from adaptive.online.config import LearnerConfig  # imports scipy, which the example does not need
+    from dehyst.adaptive.online.config import LearnerConfig  # imports scipy, which the example does not need
 
     return (
         ("The file", ServeConfig),

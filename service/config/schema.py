@@ -17,8 +17,8 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from adaptive.errors import InputError
-from service.protocol.errors import FieldError
+from dehyst.adaptive.errors import InputError
+from dehyst.service.protocol.errors import FieldError
 
 T = TypeVar("T")
 

@@ -6,18 +6,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from baselines.competition.config import CompetitionConfig
-from service.answers.guard import Limits
-from service.background.settings import RetuningConfig, WatchConfig
-from service.config.correction import CorrectionConfig, RepetitionConfig
-from service.config.limits import limits_setting
-from service.config.schema import Setting, build_settings, parse_toml, read_text
-from service.fleet.settings import FleetSettings
-from service.protocol.errors import FieldError
-from service.protocol.keys import AUTO, check_name
-from service.protocol.samples import MAX_COUNT
-from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
-from service.security.access import check_reach
+from dehyst.baselines.competition.config import CompetitionConfig
+from dehyst.service.answers.guard import Limits
+from dehyst.service.background.settings import RetuningConfig, WatchConfig
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.service.config.limits import limits_setting
+from dehyst.service.config.schema import Setting, build_settings, parse_toml, read_text
+from dehyst.service.fleet.settings import FleetSettings
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import AUTO, check_name
+from dehyst.service.protocol.samples import MAX_COUNT
+from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
+from dehyst.service.security.access import check_reach
 
 #: The model that learns.
 LEARN = "lssvm_adaptive"

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.export.c_source import c_source as c_source
-    from service.export.exporting import Frozen as Frozen
-    from service.export.exporting import compiler as compiler
-    from service.export.exporting import write_export as write_export
+    from dehyst.service.export.c_source import c_source as c_source
+    from dehyst.service.export.exporting import Frozen as Frozen
+    from dehyst.service.export.exporting import compiler as compiler
+    from dehyst.service.export.exporting import write_export as write_export
 
 __getattr__ = lazy_names(__name__)

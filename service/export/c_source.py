@@ -23,15 +23,15 @@ from uuid import NAMESPACE_OID, uuid5
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.common import Domain
-from baselines.linear import LinearInverse
-from baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
-from service.answers.guard import Limits
-from service.answers.which_model import domain_of
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.bouc_wen.model import BoucWenInverse
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.which_model import domain_of
 
 #: Support vectors that the C takes at a time; their number is filled up with weights of 0.
 _LANES: Final = 32
@@ -109,7 +109,7 @@ def c_source(model: InverseModel, limits: Limits, name: str, origin: str, start_
 
 
 def _template(file: str) -> str:
-    return (files("service.export") / file).read_text(encoding="utf-8")
+    return (files("dehyst.service.export") / file).read_text(encoding="utf-8")
 
 
 def _parts(model: InverseModel) -> _Parts:

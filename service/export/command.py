@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.cli.options import add_connection, add_epilog, add_shared
-from service.protocol.errors import FieldError
-from service.protocol.keys import ROOT, Keys
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import ROOT, Keys
 
 if TYPE_CHECKING:
-    from service.answers.guard import Limits
-    from service.export import Frozen
+    from dehyst.service.answers.guard import Limits
+    from dehyst.service.export import Frozen
 
 EPILOG = """\
 The exported model is frozen: it learns no further, and no stand-in takes its place outside the learnt range (flag 4).
@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export. Returns 0. Raises InputError and ServiceError with what is wrong."""
-    from service.export import compiler, write_export
-    from service.storage.output import clear_output
+    from dehyst.service.export import compiler, write_export
+    from dehyst.service.storage.output import clear_output
 
     if (args.data is None) == (args.from_service is None):
         raise FieldError("MODEL.npz, --from-service", "both or neither", "a model file, or the key of a service")
@@ -69,8 +69,8 @@ def _motion(text: str | None) -> tuple[float, float] | None:
 
 
 def _from_file(args: argparse.Namespace) -> Frozen:
-    from service.export import Frozen
-    from service.storage.model_file import read_bundle
+    from dehyst.service.export import Frozen
+    from dehyst.service.storage.model_file import read_bundle
 
     bundle = read_bundle(args.data)
     meta, errors = bundle.meta, bundle.meta.notes.get("heldout_rmse_um") or {}
@@ -83,8 +83,8 @@ def _from_file(args: argparse.Namespace) -> Frozen:
 
 
 def _from_service(args: argparse.Namespace) -> Frozen:
-    from service.client.client import Client
-    from service.export import Frozen
+    from dehyst.service.client.client import Client
+    from dehyst.service.export import Frozen
 
     parts = args.from_service.removeprefix(f"{ROOT}/").split("/")
     if len(parts) != 2:
@@ -103,7 +103,7 @@ def _limits(
     args: argparse.Namespace, u_min_V: float | None, u_max_V: float | None, known: Limits | None = None
 ) -> Limits:
     """The limits of the recording or the service, with those of the command line in their place."""
-    from service.answers.guard import Limits
+    from dehyst.service.answers.guard import Limits
 
     low, high = (given if given is not None else own for given, own in ((args.u_min, u_min_V), (args.u_max, u_max_V)))
     if low is None or high is None:

@@ -16,13 +16,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray, InverseModel
-from baselines.competition.champion import ChampionInverse
-from service.answers.answering import derivatives
-from service.answers.guard import Limits, guard
-from service.export.c_source import CSource, c_source, domain
-from service.protocol.errors import FieldError
-from service.storage.output import atomic_write
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.answering import derivatives
+from dehyst.service.answers.guard import Limits, guard
+from dehyst.service.export.c_source import CSource, c_source, domain
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.storage.output import atomic_write
 
 #: Periods that a table's motion runs before the one that is written: the memory of an unlimited creep has settled then.
 _PERIODS: Final = 5

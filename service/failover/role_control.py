@@ -12,16 +12,16 @@ from typing import Any, Final
 
 import zenoh
 
-from adaptive.errors import DehystError, ModelFileError
-from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from service.failover.state_transfer import fetch_state, status_of
-from service.operating.server import FREEZE, THAW, Switch
-from service.operating.verbs import MAX_WHO
-from service.protocol.container import fields_of
-from service.protocol.keys import Keys
-from service.security.authenticator import NO_KEY, Authenticator, payload_of
-from service.security.tokens import Claim, Tokens
-from service.server.axis_server import PRIMARY, STANDBY, AxisServer
+from dehyst.adaptive.errors import DehystError, ModelFileError
+from dehyst.service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
+from dehyst.service.failover.state_transfer import fetch_state, status_of
+from dehyst.service.operating.server import FREEZE, THAW, Switch
+from dehyst.service.operating.verbs import MAX_WHO
+from dehyst.service.protocol.container import fields_of
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.security.authenticator import NO_KEY, Authenticator, payload_of
+from dehyst.service.security.tokens import Claim, Tokens
+from dehyst.service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 # --- Claims to serve an axis, and the rule that decides which instance serves.
 #

@@ -15,18 +15,18 @@ from typing import Final
 
 import numpy as np
 
-from service.operating.server import Journal
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loop import SampleSink
-from service.storage.checkpoint import (
+from dehyst.service.operating.server import Journal
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loop import SampleSink
+from dehyst.service.storage.checkpoint import (
     CheckpointFolder,
     CheckpointMeta,
     decode_checkpoint,
     learn_again,
     restore_newest,
 )
-from service.storage.segments import rows_behind
+from dehyst.service.storage.segments import rows_behind
 
 # --- Checkpoints and recordings of the other instance on the same host, from which a standby can take over.
 #

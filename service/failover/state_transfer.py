@@ -16,9 +16,9 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.container import fields_of
-from service.protocol.errors import FieldError, ServiceError
-from service.security.authenticator import NO_KEY, Authenticator
+from dehyst.service.protocol.container import fields_of
+from dehyst.service.protocol.errors import FieldError, ServiceError
+from dehyst.service.security.authenticator import NO_KEY, Authenticator
 
 #: Size of a part, bytes; a packet holds 64 KiB.
 _PART_BYTES: Final = 56 * 1024

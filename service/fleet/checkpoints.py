@@ -13,14 +13,14 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 
-from adaptive.errors import DehystError
-from adaptive.fleet.fleet import Fleet
-from adaptive.types import StateDict, prefixed, under
-from service.config.settings import LEARN
-from service.protocol.model import digests
-from service.storage.checkpoint import LOCK, SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
-from service.storage.output import atomic_write
-from service.storage.owner import FolderOwner
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.fleet.fleet import Fleet
+from dehyst.adaptive.types import StateDict, prefixed, under
+from dehyst.service.config.settings import LEARN
+from dehyst.service.protocol.model import digests
+from dehyst.service.storage.checkpoint import LOCK, SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
+from dehyst.service.storage.output import atomic_write
+from dehyst.service.storage.owner import FolderOwner
 
 #: How long a start waits for a process that still holds the folder, s.
 _HOLD_S = 5.0

@@ -16,32 +16,32 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from adaptive.compiled import compiled
-from adaptive.errors import DehystError
-from adaptive.fleet.fleet import Fleet, FleetConfig
-from adaptive.fleet.snapshot import FleetSnapshot
-from adaptive.fleet.state import OUTCOMES
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import BoolArray, FloatArray
-from service.answers.guard import Limits, limit
-from service.config.learner import learner_config
-from service.config.settings import LEARN, ServeConfig
-from service.fleet.checkpoints import FleetCheckpoints
-from service.fleet.settings import FleetSettings
-from service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
-from service.operating.server import FREEZE, THAW, Journal, OperationsServer
-from service.operating.verbs import Outcome, Request, take
-from service.protocol.container import JSON, fields_of, to_json
-from service.protocol.delta import FollowedState, encode_delta
-from service.protocol.errors import FieldError, ServiceError
-from service.protocol.keys import Keys
-from service.protocol.model import model_parts
-from service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
-from service.runtime.session import open_service
-from service.security.authenticator import HeardSamples
-from service.server.process import authenticator_of
-from service.server.query_answers import guarded
-from service.storage.model_file import read_bundle
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
+from dehyst.adaptive.fleet.snapshot import FleetSnapshot
+from dehyst.adaptive.fleet.state import OUTCOMES
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.service.answers.guard import Limits, limit
+from dehyst.service.config.learner import learner_config
+from dehyst.service.config.settings import LEARN, ServeConfig
+from dehyst.service.fleet.checkpoints import FleetCheckpoints
+from dehyst.service.fleet.settings import FleetSettings
+from dehyst.service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
+from dehyst.service.operating.server import FREEZE, THAW, Journal, OperationsServer
+from dehyst.service.operating.verbs import Outcome, Request, take
+from dehyst.service.protocol.container import JSON, fields_of, to_json
+from dehyst.service.protocol.delta import FollowedState, encode_delta
+from dehyst.service.protocol.errors import FieldError, ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import model_parts
+from dehyst.service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
+from dehyst.service.runtime.session import open_service
+from dehyst.service.security.authenticator import HeardSamples
+from dehyst.service.server.process import authenticator_of
+from dehyst.service.server.query_answers import guarded
+from dehyst.service.storage.model_file import read_bundle
 
 #: Name of a fleet in the keys, in place of an axis.
 NAME: Final = "fleet"

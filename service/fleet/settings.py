@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from service.answers.guard import Limits
-from service.config.limits import limits_setting
-from service.config.schema import Setting
-from service.protocol.errors import FieldError
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.limits import limits_setting
+from dehyst.service.config.schema import Setting
+from dehyst.service.protocol.errors import FieldError
 
 #: Most axes of a fleet: what a message for all may hold.
 MOST_AXES = 4096

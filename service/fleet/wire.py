@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from service.fleet.settings import MOST_AXES
-from service.protocol.errors import FieldError
-from service.protocol.samples import (
+from dehyst.service.fleet.settings import MOST_AXES
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import (
     FLEET_CHANGES,
     FLEET_QUERY,
     FLEET_REPLY,

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.identification.identifying import Identified as Identified
-    from service.identification.identifying import Stretch as Stretch
-    from service.identification.identifying import draw_identification as draw_identification
-    from service.identification.identifying import identify_all as identify_all
-    from service.identification.identifying import identify_one as identify_one
+    from dehyst.service.identification.identifying import Identified as Identified
+    from dehyst.service.identification.identifying import Stretch as Stretch
+    from dehyst.service.identification.identifying import draw_identification as draw_identification
+    from dehyst.service.identification.identifying import identify_all as identify_all
+    from dehyst.service.identification.identifying import identify_one as identify_one
 
 __getattr__ = lazy_names(__name__)

@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import DehystError, InputError
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.types import BoolArray, FloatArray, InverseModel
-from baselines import fit_bouc_wen, fit_linear, fit_mpi
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.linear import LinearInverse
-from baselines.prandtl_ishlinskii.model import MpiInverse
-from service.protocol.errors import FieldError
-from service.reports.plot_style import figure, label, legend, line, save
-from service.viewer.colours import MEASURED, TRAINING, model_colour
-from sim.recordings import Recording, Repaired
+from dehyst.adaptive.errors import DehystError, InputError
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.smoothing import SmootherConfig, smooth_recording
+from dehyst.adaptive.types import BoolArray, FloatArray, InverseModel
+from dehyst.baselines import fit_bouc_wen, fit_linear, fit_mpi
+from dehyst.baselines.bouc_wen.model import BoucWenInverse
+from dehyst.baselines.linear import LinearInverse
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.reports.plot_style import figure, label, legend, line, save
+from dehyst.service.viewer.colours import MEASURED, TRAINING, model_colour
+from dehyst.sim.recordings import Recording, Repaired
 
 # --- Identification and scores.
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from adaptive.errors import InputError
-from service.protocol.errors import FieldError
-from sim.recordings import ColumnMap, Finding, Recording, load_map, read
-from sim.recordings.columns import QUANTITIES, MissingError
+from dehyst.adaptive.errors import InputError
+from dehyst.service.protocol.errors import FieldError
+from dehyst.sim.recordings import ColumnMap, Finding, Recording, load_map, read
+from dehyst.sim.recordings.columns import QUANTITIES, MissingError
 
 READING = """\
 Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.intake.sample_queue import SampleQueue as SampleQueue
-    from service.intake.sequence import SampleClock as SampleClock
-    from service.intake.sequence import SequenceTracker as SequenceTracker
+    from dehyst.service.intake.sample_queue import SampleQueue as SampleQueue
+    from dehyst.service.intake.sequence import SampleClock as SampleClock
+    from dehyst.service.intake.sequence import SequenceTracker as SequenceTracker
 
 __getattr__ = lazy_names(__name__)

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.protocol.query import Pending
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.query import Pending
 
 #: Largest difference, as a share of the voltage range: rounding by a converter, noise of a voltage that is read back.
 TOLERANCE: Final = 0.01

@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from adaptive.types import BoolArray
-from service.protocol.errors import ServiceError
-from service.protocol.samples import SampleBatch, joined
+from dehyst.adaptive.types import BoolArray
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.samples import SampleBatch, joined
 
 T = TypeVar("T")
 

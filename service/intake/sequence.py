@@ -14,7 +14,7 @@ import math
 from collections import deque
 from typing import Annotated, Any, Final
 
-from adaptive.state import Entry
+from dehyst.adaptive.state import Entry
 
 IN_ORDER: Final = "in_order"
 LATE: Final = "late"

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.operating.remote import Standbys as Standbys
-    from service.operating.remote import operate as operate
-    from service.operating.remote import screen as screen
-    from service.operating.remote import statuses as statuses
-    from service.operating.server import Journal as Journal
-    from service.operating.server import OperationsServer as OperationsServer
-    from service.operating.verbs import Request as Request
-    from service.operating.verbs import Verbs as Verbs
+    from dehyst.service.operating.remote import Standbys as Standbys
+    from dehyst.service.operating.remote import operate as operate
+    from dehyst.service.operating.remote import screen as screen
+    from dehyst.service.operating.remote import statuses as statuses
+    from dehyst.service.operating.server import Journal as Journal
+    from dehyst.service.operating.server import OperationsServer as OperationsServer
+    from dehyst.service.operating.verbs import Request as Request
+    from dehyst.service.operating.verbs import Verbs as Verbs
 
 __getattr__ = lazy_names(__name__)

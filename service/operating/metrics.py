@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from adaptive.errors import InputError
+from dehyst.adaptive.errors import InputError
 
 _LABELS: Final = ("stage", "axis", "role", "instance")
 #: Name, kind, help, and the way to the value in a status.

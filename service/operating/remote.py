@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import zenoh
 
-from service.operating.verbs import Request, encode_request
-from service.protocol.container import fields_of
-from service.protocol.errors import (
+from dehyst.service.operating.verbs import Request, encode_request
+from dehyst.service.protocol.container import fields_of
+from dehyst.service.protocol.errors import (
     FieldError,
     NoReplyError,
     ReplyTimeoutError,
@@ -20,8 +20,8 @@ from service.protocol.errors import (
     UnsignedReplyError,
     error_from_json,
 )
-from service.protocol.keys import ROOT, Keys
-from service.security.authenticator import Authenticator, own_authenticator
+from dehyst.service.protocol.keys import ROOT, Keys
+from dehyst.service.security.authenticator import Authenticator, own_authenticator
 
 # --- Commands and statuses over the wire.
 

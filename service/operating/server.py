@@ -17,13 +17,13 @@ from typing import Any, Final, Protocol
 
 import zenoh
 
-from adaptive.errors import DehystError
-from service.operating.verbs import MAX_BYTES, Outcome, Request, decode_request
-from service.protocol.container import JSON, fields_of, to_json
-from service.protocol.errors import FieldError, ServiceError, error_to_json
-from service.protocol.keys import Keys
-from service.security.authenticator import NO_KEY, Authenticator
-from service.storage.output import append_line
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.operating.verbs import MAX_BYTES, Outcome, Request, decode_request
+from dehyst.service.protocol.container import JSON, fields_of, to_json
+from dehyst.service.protocol.errors import FieldError, ServiceError, error_to_json
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.security.authenticator import NO_KEY, Authenticator
+from dehyst.service.storage.output import append_line
 
 # --- The journal of operations: one JSON line per operation in a folder of the axis.
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-from adaptive.errors import DehystError
-from service.protocol.errors import FieldError, ServiceError
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.protocol.errors import FieldError, ServiceError
 
 # --- The request of an operator: JSON, decoded strictly.
 

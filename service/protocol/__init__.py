@@ -7,7 +7,7 @@ their stored kind, `errors` the exceptions and error replies.
 
 from __future__ import annotations
 
-from service.protocol.errors import (
+from dehyst.service.protocol.errors import (
     BehindError,
     FieldError,
     NoReplyError,
@@ -16,7 +16,7 @@ from service.protocol.errors import (
     ServiceError,
     SessionError,
 )
-from service.protocol.keys import AUTO, Keys
+from dehyst.service.protocol.keys import AUTO, Keys
 
 __all__ = [
     "AUTO",

@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import ModelFileError
-from adaptive.types import StateDict
-from service.protocol.errors import FieldError
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.types import StateDict
+from dehyst.service.protocol.errors import FieldError
 
 # --- JSON on the wire: what other processes send, and what this one answers.
 

@@ -15,13 +15,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, StateDict
-from baselines.competition.champion import ChampionInverse
-from service.protocol.container import encode_body
-from service.protocol.errors import FieldError
-from service.protocol.model import ModelMessage, assemble, check_model, pack_model
-from service.protocol.samples import DELTA, VERSION, check_header, check_length
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import FloatArray, StateDict
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.protocol.container import encode_body
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.model import ModelMessage, assemble, check_model, pack_model
+from dehyst.service.protocol.samples import DELTA, VERSION, check_header, check_length
 
 #: version, kind, options, number of changes, snapshot_seq, fingerprints of the model before and after
 _HEAD: Final = struct.Struct("<BBHIqII")

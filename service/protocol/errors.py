@@ -19,7 +19,7 @@ import json
 import math
 from typing import Any, Final
 
-from adaptive.errors import DehystError, InputError
+from dehyst.adaptive.errors import DehystError, InputError
 
 #: ``error`` of the error reply to a query that may be repeated after ``retry_after_s``.
 BUSY: Final = "busy"

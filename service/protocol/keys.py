@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from service.protocol.errors import FieldError
+from dehyst.service.protocol.errors import FieldError
 
 ROOT = "dehyst/v1"
 #: A name in a key: lower case, digits, underscore and hyphen, beginning with a letter, at most 64 characters.

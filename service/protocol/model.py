@@ -13,22 +13,22 @@ from typing import Any, Final, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import ModelFileError
-from adaptive.types import FloatArray, InverseModel, StateDict
-from service.protocol.container import decode_body, encode_body, split_state
-from service.protocol.errors import FieldError
-from service.protocol.samples import MODEL, VERSION, check_header, check_length
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.types import FloatArray, InverseModel, StateDict
+from dehyst.service.protocol.container import decode_body, encode_body, split_state
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import MODEL, VERSION, check_header, check_length
 
 # --- Model classes by the kind under which files and messages store them.
 
 #: Kind in files and messages -> "module:class". The class has a ``from_state(StateDict)`` that builds an equal model.
 #: A module is imported when the first model of its kind is built: a client loads the models that it uses, no others.
 MODEL_CLASSES: Final = {
-    "lssvm": "adaptive.inverse_model:LssvmInverse",
-    "linear": "baselines.linear:LinearInverse",
-    "bouc_wen": "baselines.bouc_wen.model:BoucWenInverse",
-    "mpi": "baselines.prandtl_ishlinskii.model:MpiInverse",
-    "champion": "baselines.competition.champion:ChampionInverse",
+    "lssvm": "dehyst.adaptive.inverse_model:LssvmInverse",
+    "linear": "dehyst.baselines.linear:LinearInverse",
+    "bouc_wen": "dehyst.baselines.bouc_wen.model:BoucWenInverse",
+    "mpi": "dehyst.baselines.prandtl_ishlinskii.model:MpiInverse",
+    "champion": "dehyst.baselines.competition.champion:ChampionInverse",
 }
 
 

@@ -8,10 +8,10 @@ from typing import Final, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.compiled import all_finite
-from adaptive.types import FloatArray
-from service.protocol.errors import FieldError
-from service.protocol.samples import (
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import (
     FEEDFORWARD_QUERY,
     FEEDFORWARD_REPLY,
     HEADER,

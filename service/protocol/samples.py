@@ -16,9 +16,9 @@ from typing import Any, Final, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.compiled import all_finite
-from adaptive.types import FloatArray
-from service.protocol.errors import FieldError
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.errors import FieldError
 
 VERSION: Final = 1
 SAMPLES: Final = 1

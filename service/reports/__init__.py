@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.reports.diagnosis import write_report as write_report
-    from service.reports.diagnosis_page import Source as Source
-    from service.reports.plot_style import envelope as envelope
-    from service.reports.plot_style import figure as figure
-    from service.reports.plot_style import legend as legend
-    from service.reports.plot_style import line as line
-    from service.reports.plot_style import save as save
+    from dehyst.service.reports.diagnosis import write_report as write_report
+    from dehyst.service.reports.diagnosis_page import Source as Source
+    from dehyst.service.reports.plot_style import envelope as envelope
+    from dehyst.service.reports.plot_style import figure as figure
+    from dehyst.service.reports.plot_style import legend as legend
+    from dehyst.service.reports.plot_style import line as line
+    from dehyst.service.reports.plot_style import save as save
 
 __getattr__ = lazy_names(__name__)

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from service.reports.diagnosis_page import Source, length, page, picture_name
-from service.reports.plot_style import figure, label, legend, line, save
-from service.viewer import colours
-from service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
-from sim.diagnosis.export import export_stage
-from sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause, picture
-from sim.pictures import MEASURED, WITH, WITHOUT
-from sim.stage.file import save_stage
+from dehyst.adaptive.errors import InputError
+from dehyst.service.reports.diagnosis_page import Source, length, page, picture_name
+from dehyst.service.reports.plot_style import figure, label, legend, line, save
+from dehyst.service.viewer import colours
+from dehyst.service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
+from dehyst.sim.diagnosis.export import export_stage
+from dehyst.sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause, picture
+from dehyst.sim.pictures import MEASURED, WITH, WITHOUT
+from dehyst.sim.stage.file import save_stage
 
 __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
 
@@ -48,7 +48,7 @@ def write_report(
     except OSError as error:
         raise InputError(f"--out: cannot write into {out}: {error.strerror}; name a folder you may write to") from error
     if rrd:
-        from service.reports.diagnosis_viewer import write_viewer
+        from dehyst.service.reports.diagnosis_viewer import write_viewer
 
         write_viewer(out / "diagnosis.rrd", diagnosis, source.data, text)
     return data

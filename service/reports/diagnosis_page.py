@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim.diagnosis.export import ExportedStage
-from sim.diagnosis.result import TEST, Diagnosis, NamedCause
-from sim.effects import Kind
+from dehyst.sim.diagnosis.export import ExportedStage
+from dehyst.sim.diagnosis.result import TEST, Diagnosis, NamedCause
+from dehyst.sim.effects import Kind
 
 #: Units by the suffix of a number's name.
 _UNITS = {

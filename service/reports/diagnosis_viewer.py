@@ -12,15 +12,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.reports.diagnosis_page import spaced
-from service.reports.plot_style import envelope
-from service.viewer.colours import AFTER, BEFORE, rgb
-from service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
-from service.viewer.style import FRAME, LABEL, WHITE, Colour
-from sim.diagnosis.result import Diagnosis, picture
-from sim.pictures import MEASURED, WITH, WITHOUT, Curve, Picture
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.reports.diagnosis_page import spaced
+from dehyst.service.reports.plot_style import envelope
+from dehyst.service.viewer.colours import AFTER, BEFORE, rgb
+from dehyst.service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
+from dehyst.service.viewer.style import FRAME, LABEL, WHITE, Colour
+from dehyst.sim.diagnosis.result import Diagnosis, picture
+from dehyst.sim.pictures import MEASURED, WITH, WITHOUT, Curve, Picture
 
 APPLICATION, TIMELINE = "dehyst-diagnosis", "t_s"
 COLOURS: dict[str, Colour] = {MEASURED: WHITE, WITHOUT: rgb(BEFORE), WITH: rgb(AFTER)}

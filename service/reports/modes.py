@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.reports.plot_style import figure, label, legend, line, save
-from service.reports.tables import markdown
-from service.viewer.colours import AFTER, BEFORE, MEASURED, NOISE_BAND, SERIES
-from sim.modal import ModalStudy
-from sim.modal.periods import smoothed
-from sim.modal.study import RAYLEIGH_RATIO, Level, Mode
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.reports.plot_style import figure, label, legend, line, save
+from dehyst.service.reports.tables import markdown
+from dehyst.service.viewer.colours import AFTER, BEFORE, MEASURED, NOISE_BAND, SERIES
+from dehyst.sim.modal import ModalStudy
+from dehyst.sim.modal.periods import smoothed
+from dehyst.sim.modal.study import RAYLEIGH_RATIO, Level, Mode
 
 
 def write_modes(out: Path, study: ModalStudy, *, pictures: bool = True) -> dict[str, Any]:

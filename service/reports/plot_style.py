@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray
-from sim.pictures import MOST_POINTS, envelope
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.pictures import MOST_POINTS, envelope
 
 __all__ = ["MOST_POINTS", "envelope", "figure", "label", "legend", "line", "save", "thinned"]
 

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.runtime.logging_setup import set_up_logging as set_up_logging
-    from service.runtime.session import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT
-    from service.runtime.session import check_endpoint as check_endpoint
-    from service.runtime.session import open_client as open_client
-    from service.runtime.session import open_router as open_router
-    from service.runtime.session import open_service as open_service
-    from service.runtime.stopping import StopSignal as StopSignal
+    from dehyst.service.runtime.logging_setup import set_up_logging as set_up_logging
+    from dehyst.service.runtime.session import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT
+    from dehyst.service.runtime.session import check_endpoint as check_endpoint
+    from dehyst.service.runtime.session import open_client as open_client
+    from dehyst.service.runtime.session import open_router as open_router
+    from dehyst.service.runtime.session import open_service as open_service
+    from dehyst.service.runtime.stopping import StopSignal as StopSignal
 
 __getattr__ = lazy_names(__name__)

@@ -8,7 +8,7 @@ import importlib
 import os
 from typing import Any, Final
 
-from service.protocol.errors import FieldError
+from dehyst.service.protocol.errors import FieldError
 
 # Now: where no descriptor is left, nothing can be imported.
 resource: Any = None

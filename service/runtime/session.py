@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.errors import FieldError, SessionError
-from service.runtime.descriptors import too_few
+from dehyst.service.protocol.errors import FieldError, SessionError
+from dehyst.service.runtime.descriptors import too_few
 
 # --- Delivery of messages that are sent only once, and whether a publisher has subscribers.
 

@@ -20,10 +20,10 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.errors import FieldError, ServiceError
-from service.protocol.keys import ROOT, check_name
-from service.runtime.session import is_loopback, read_zenoh_config
-from service.storage.output import atomic_write
+from dehyst.service.protocol.errors import FieldError, ServiceError
+from dehyst.service.protocol.keys import ROOT, check_name
+from dehyst.service.runtime.session import is_loopback, read_zenoh_config
+from dehyst.service.storage.output import atomic_write
 
 # --- Zenoh's access control for this project: what each role may send to a service or a router (docs/access.md).
 #

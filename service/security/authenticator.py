@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
-from service.protocol.errors import FieldError
+from dehyst.service.protocol.errors import FieldError
 
 _LOGGER: Final = logging.getLogger("dehyst.security")
 #: Environment variable with the path of the key; `OPEN`: without one.

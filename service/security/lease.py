@@ -18,11 +18,11 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.errors import CommandHeldError
-from service.protocol.keys import Keys
-from service.runtime.session import LEASE_S, SURELY
-from service.security.authenticator import SENDER, STAMP, Authenticator, Rising, payload_of
-from service.security.tokens import Holder, Tokens
+from dehyst.service.protocol.errors import CommandHeldError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import LEASE_S, SURELY
+from dehyst.service.security.authenticator import SENDER, STAMP, Authenticator, Rising, payload_of
+from dehyst.service.security.tokens import Holder, Tokens
 
 _LOGGER: Final = logging.getLogger("dehyst.security")
 #: Longest wait for the tokens that are alive, s; on loopback it takes 0.3 ms.

@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import zenoh
 
-from service.protocol.keys import Keys
-from service.security.authenticator import Authenticator
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.security.authenticator import Authenticator
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.server.axis import Axis as Axis
-    from service.server.axis import EventLog as EventLog
-    from service.server.axis_loading import load_axis as load_axis
-    from service.server.axis_loop import AxisLoop as AxisLoop
-    from service.server.axis_server import AxisServer as AxisServer
-    from service.server.process import Service as Service
-    from service.server.status import axis_status as axis_status
+    from dehyst.service.server.axis import Axis as Axis
+    from dehyst.service.server.axis import EventLog as EventLog
+    from dehyst.service.server.axis_loading import load_axis as load_axis
+    from dehyst.service.server.axis_loop import AxisLoop as AxisLoop
+    from dehyst.service.server.axis_server import AxisServer as AxisServer
+    from dehyst.service.server.process import Service as Service
+    from dehyst.service.server.status import axis_status as axis_status
 
 __getattr__ = lazy_names(__name__)

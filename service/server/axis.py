@@ -17,32 +17,32 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Final, NamedTuple, Protocol
 
-from adaptive.errors import ModelFileError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
-from adaptive.state import Entry, Refused, load, part_of, restore, save
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
-from baselines.competition.champion import ChampionInverse
-from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
-from service.answers.guard import Limits
-from service.answers.slices import Pace
-from service.answers.which_model import (
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
+from dehyst.adaptive.state import Entry, Refused, load, part_of, restore, save
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.slices import Pace
+from dehyst.service.answers.which_model import (
     Answering,
     Seen,
     answering,
     is_identified,
     trust_by_age,
 )
-from service.background.retuner import Retuned
-from service.config.settings import LEARN, AxisConfig
-from service.intake.command_witness import CommandWitness
-from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
-from service.protocol.errors import FieldError
-from service.protocol.keys import AUTO
-from service.protocol.model import Safety, digests, fingerprint, stored_kind
-from service.protocol.query import FeedforwardQuery, Trajectory
-from service.protocol.samples import SampleBatch
-from service.server.learner_supervisor import (
+from dehyst.service.background.retuner import Retuned
+from dehyst.service.config.settings import LEARN, AxisConfig
+from dehyst.service.intake.command_witness import CommandWitness
+from dehyst.service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import AUTO
+from dehyst.service.protocol.model import Safety, digests, fingerprint, stored_kind
+from dehyst.service.protocol.query import FeedforwardQuery, Trajectory
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.learner_supervisor import (
     NOT_COMMANDED,
     NOT_LEARNING,
     UNUSABLE,
@@ -52,7 +52,7 @@ from service.server.learner_supervisor import (
     champion_of,
     stored_model,
 )
-from service.server.moves import Moves
+from dehyst.service.server.moves import Moves
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
 

@@ -10,19 +10,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import ModelFileError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import InverseModel, OnlineModel, Sample
-from baselines.competition.competition import Competition, Smooths
-from service.answers import guard
-from service.answers.guard import Limits
-from service.config.settings import COMPETE, AxisConfig
-from service.protocol.errors import FieldError
-from service.protocol.model import digests
-from service.server.axis import Axis
-from service.server.learner_supervisor import champion_of
-from service.storage.checkpoint import CheckpointFolder
-from service.storage.model_file import Bundle, BundleMeta, read_bundle
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import InverseModel, OnlineModel, Sample
+from dehyst.baselines.competition.competition import Competition, Smooths
+from dehyst.service.answers import guard
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import COMPETE, AxisConfig
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.model import digests
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.learner_supervisor import champion_of
+from dehyst.service.storage.checkpoint import CheckpointFolder
+from dehyst.service.storage.model_file import Bundle, BundleMeta, read_bundle
 
 #: Share of the identified range by which a desired point may lie beyond it where the configuration sets no limit.
 RANGE_MARGIN: Final = 0.05
@@ -35,8 +35,8 @@ LearnerFactory = Callable[[InverseModel, dict[str, Any], Limits], OnlineModel]
 
 def make_learner(model: InverseModel, settings: dict[str, Any], limits: Limits) -> OnlineModel:
     """The learner of this project, started from ``model``. Raises InputError on an unknown setting."""
-    from adaptive.online.learner import Learner
-    from service.config.learner import learner_config
+    from dehyst.adaptive.online.learner import Learner
+    from dehyst.service.config.learner import learner_config
 
     if not isinstance(model, LssvmInverse):
         raise FieldError("learn", f"{model.name!r}, a {type(model).__name__}", "an LSSVM model of the file, or none")

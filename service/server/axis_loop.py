@@ -14,12 +14,12 @@ from typing import Any, Final, Protocol
 
 from numpy.typing import ArrayLike
 
-from service.background.retuner import Retuner
-from service.intake.sample_queue import Arrived, Job, SampleQueue, Thinner
-from service.intake.sequence import AHEAD
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.learner_supervisor import standing_of
+from dehyst.service.background.retuner import Retuner
+from dehyst.service.intake.sample_queue import Arrived, Job, SampleQueue, Thinner
+from dehyst.service.intake.sequence import AHEAD
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.learner_supervisor import standing_of
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"

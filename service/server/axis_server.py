@@ -10,24 +10,24 @@ from typing import Any, Final
 
 import zenoh
 
-from service.background.retuner import Retuner
-from service.failover.state_transfer import tell_standbys
-from service.intake.sample_queue import SampleQueue
-from service.operating.server import Journal, OperationsServer
-from service.operating.verbs import Background, Verbs
-from service.protocol.container import to_json
-from service.protocol.keys import Keys
-from service.protocol.samples import decode_samples
-from service.security.authenticator import NO_KEY, Authenticator, HeardSamples
-from service.security.lease import Holders
-from service.server.axis import Axis
-from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
-from service.server.deltas import DeltaStreams
-from service.server.health import Arrivals, DiskFailures, Health, SampleLosses, Staleness
-from service.server.long_queries import LongQueries
-from service.server.query_answers import LatencyMeter, QueryAnswers
-from service.server.status import Publications, WriteRate, axis_status
-from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
+from dehyst.service.background.retuner import Retuner
+from dehyst.service.failover.state_transfer import tell_standbys
+from dehyst.service.intake.sample_queue import SampleQueue
+from dehyst.service.operating.server import Journal, OperationsServer
+from dehyst.service.operating.verbs import Background, Verbs
+from dehyst.service.protocol.container import to_json
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.samples import decode_samples
+from dehyst.service.security.authenticator import NO_KEY, Authenticator, HeardSamples
+from dehyst.service.security.lease import Holders
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from dehyst.service.server.deltas import DeltaStreams
+from dehyst.service.server.health import Arrivals, DiskFailures, Health, SampleLosses, Staleness
+from dehyst.service.server.long_queries import LongQueries
+from dehyst.service.server.query_answers import LatencyMeter, QueryAnswers
+from dehyst.service.server.status import Publications, WriteRate, axis_status
+from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from baselines.competition.champion import ChampionInverse
-from service.answers.answering import Served
-from service.protocol.delta import DeltaMessage, FollowedState, doubles, encode_delta
-from service.protocol.keys import AUTO
-from service.protocol.model import model_parts
-from service.server.axis import Axis
-from service.server.moves import Move
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.answering import Served
+from dehyst.service.protocol.delta import DeltaMessage, FollowedState, doubles, encode_delta
+from dehyst.service.protocol.keys import AUTO
+from dehyst.service.protocol.model import model_parts
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.moves import Move
 
 #: Interval of the check for followers, s.
 _LOOK_S: Final = 0.05

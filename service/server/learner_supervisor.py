@@ -15,9 +15,9 @@ from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 
-from adaptive.errors import DehystError, ModelFileError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.gates import (
+from dehyst.adaptive.errors import DehystError, ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.gates import (
     FROZEN,
     GAP,
     LEARNT,
@@ -28,14 +28,14 @@ from adaptive.online.gates import (
     TIMING,
     UNEXCITED,
 )
-from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
-from adaptive.state import Entry, Kinded, load, part_of, restore, save
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
-from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import Competition, check_like
-from service.answers.answering import Served
-from service.answers.guard import Limits
-from service.answers.which_model import (
+from dehyst.adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
+from dehyst.adaptive.state import Entry, Kinded, load, part_of, restore, save
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.baselines.competition.competition import Competition, check_like
+from dehyst.service.answers.answering import Served
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.which_model import (
     LEARNER_FAILED,
     MODELS,
     NOTHING_LEARNT,
@@ -46,9 +46,9 @@ from service.answers.which_model import (
     ModelChoice,
     rule_of,
 )
-from service.background.retuner import Adoptions, Retuned
-from service.protocol.keys import AUTO
-from service.protocol.model import build_model, stored_kind
+from dehyst.service.background.retuner import Adoptions, Retuned
+from dehyst.service.protocol.keys import AUTO
+from dehyst.service.protocol.model import build_model, stored_kind
 
 # --- The watch over the samples. What is wrong with them has a name, with hysteresis, and ends by itself:
 #

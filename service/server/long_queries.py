@@ -23,8 +23,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from service.answers.slices import Pace, StoppedError
-from service.protocol.errors import BusyError, ServiceError
+from dehyst.service.answers.slices import Pace, StoppedError
+from dehyst.service.protocol.errors import BusyError, ServiceError
 
 #: Most points of a query that is answered at once: a quarter of a millisecond with a window of 500.
 SHORT: Final = 128

@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adaptive.compiled import all_finite
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import MovingPart, OnlineModel
-from service.answers.answering import Served
+from dehyst.adaptive.compiled import all_finite
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import MovingPart, OnlineModel
+from dehyst.service.answers.answering import Served
 
 #: Moves that wait for the publishing thread; of more the oldest are left out, which followers do not notice.
 _KEPT: Final = 64

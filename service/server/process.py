@@ -16,21 +16,21 @@ from typing import Any, Final
 import zenoh
 from threadpoolctl import threadpool_limits
 
-from service.config.settings import ServeConfig
-from service.failover.role_control import RoleControl
-from service.failover.standby_model import PeerFiles, standby_folder
-from service.protocol.errors import FieldError, SessionError
-from service.protocol.keys import Keys
-from service.runtime.memory import TRIM_S, give_back, keep_little
-from service.runtime.session import open_service
-from service.security.authenticator import NO_KEY, Authenticator, default_key, read_key
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.server.axis_loop import SampleSink, SampleWatcher
-from service.server.axis_server import PRIMARY, STANDBY, AxisServer
-from service.server.long_queries import LongQueries
-from service.server.status import UNSIGNED
-from service.storage.checkpoint import restore_newest
+from dehyst.service.config.settings import ServeConfig
+from dehyst.service.failover.role_control import RoleControl
+from dehyst.service.failover.standby_model import PeerFiles, standby_folder
+from dehyst.service.protocol.errors import FieldError, SessionError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.memory import TRIM_S, give_back, keep_little
+from dehyst.service.runtime.session import open_service
+from dehyst.service.security.authenticator import NO_KEY, Authenticator, default_key, read_key
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.server.axis_loop import SampleSink, SampleWatcher
+from dehyst.service.server.axis_server import PRIMARY, STANDBY, AxisServer
+from dehyst.service.server.long_queries import LongQueries
+from dehyst.service.server.status import UNSIGNED
+from dehyst.service.storage.checkpoint import restore_newest
 
 _LOGGER: Final = logging.getLogger("dehyst.service")
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
@@ -59,7 +59,7 @@ def make_recorder(axis: Axis) -> SampleSink | None:
     config = axis.config
     if config.recorder is None:
         return None
-    from service.storage.recorder import Recorder, RecorderConfig
+    from dehyst.service.storage.recorder import Recorder, RecorderConfig
 
     return Recorder(RecorderConfig(config.recorder, axis.owner, max_bytes=config.recorder_bytes), hold_s=_HOLD_S)
 
@@ -68,7 +68,7 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     """The background diagnosis of an axis, or None if the configuration switches it off."""
     if not axis.config.diagnosis.enabled:
         return None
-    from service.background.watcher import Watcher
+    from dehyst.service.background.watcher import Watcher
 
     return Watcher(axis, axis.config.diagnosis)
 

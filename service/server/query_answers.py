@@ -14,20 +14,20 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from adaptive.errors import DehystError
-from service.answers.slices import Pace
-from service.failover.state_transfer import part_of
-from service.protocol.container import JSON, to_json
-from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
-from service.protocol.keys import Keys
-from service.protocol.model import encode_model
-from service.protocol.query import decode_query, encode_reply, points_of
-from service.protocol.samples import MAX_COUNT
-from service.security.authenticator import NO_KEY, Authenticator
-from service.server.axis import Axis
-from service.server.deltas import DeltaStreams
-from service.server.long_queries import SHORT, LongQueries
-from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
+from dehyst.adaptive.errors import DehystError
+from dehyst.service.answers.slices import Pace
+from dehyst.service.failover.state_transfer import part_of
+from dehyst.service.protocol.container import JSON, to_json
+from dehyst.service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import encode_model
+from dehyst.service.protocol.query import decode_query, encode_reply, points_of
+from dehyst.service.protocol.samples import MAX_COUNT
+from dehyst.service.security.authenticator import NO_KEY, Authenticator
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.deltas import DeltaStreams
+from dehyst.service.server.long_queries import SHORT, LongQueries
+from dehyst.service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
 
 # --- How long the service took over its queries: the last thousand, and counts since the start.
 

@@ -12,18 +12,18 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.container import JSON, to_json
-from service.protocol.keys import AUTO, Keys
-from service.protocol.model import fingerprint, stored_kind
-from service.protocol.samples import VERSION
-from service.runtime.memory import in_use
-from service.runtime.session import SURELY, is_followed
-from service.security.authenticator import NO_KEY, Authenticator
-from service.security.refusals import refusal_counters
-from service.server.axis_loop import AxisLoop
-from service.server.deltas import DeltaStreams
-from service.server.health import Health
-from service.server.query_answers import LatencyMeter, QueryAnswers
+from dehyst.service.protocol.container import JSON, to_json
+from dehyst.service.protocol.keys import AUTO, Keys
+from dehyst.service.protocol.model import fingerprint, stored_kind
+from dehyst.service.protocol.samples import VERSION
+from dehyst.service.runtime.memory import in_use
+from dehyst.service.runtime.session import SURELY, is_followed
+from dehyst.service.security.authenticator import NO_KEY, Authenticator
+from dehyst.service.security.refusals import refusal_counters
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.deltas import DeltaStreams
+from dehyst.service.server.health import Health
+from dehyst.service.server.query_answers import LatencyMeter, QueryAnswers
 
 # --- The status of one axis, as JSON; docs/protocol.md lists the fields.
 

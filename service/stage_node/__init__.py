@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.stage_node.faults import Fault as Fault
-    from service.stage_node.faults import Injector as Injector
-    from service.stage_node.faults import fault_key as fault_key
-    from service.stage_node.node import NodeConfig as NodeConfig
-    from service.stage_node.node import StageNode as StageNode
-    from service.stage_node.node import status_key as status_key
+    from dehyst.service.stage_node.faults import Fault as Fault
+    from dehyst.service.stage_node.faults import Injector as Injector
+    from dehyst.service.stage_node.faults import fault_key as fault_key
+    from dehyst.service.stage_node.node import NodeConfig as NodeConfig
+    from dehyst.service.stage_node.node import StageNode as StageNode
+    from dehyst.service.stage_node.node import status_key as status_key
 
 __getattr__ = lazy_names(__name__)

@@ -9,13 +9,13 @@ import numpy as np
 import pyarrow
 from pyarrow import parquet
 
-from adaptive.types import FloatArray
-from service.config.reference import example
-from service.protocol.errors import FieldError
-from sim.signals.voltages import generalisation_input, multitone, training_input
-from sim.stage.file import save_stage
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.config.reference import example
+from dehyst.service.protocol.errors import FieldError
+from dehyst.sim.signals.voltages import generalisation_input, multitone, training_input
+from dehyst.sim.stage.file import save_stage
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 #: Files and folders that are written.
 NAMES: Final = (

@@ -16,11 +16,11 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.protocol import samples as wire
-from service.protocol.errors import FieldError
-from service.stage_node.faults import Injector
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.stage_node.faults import Injector
 
 # --- The commands of a stage node: voltages by sequence number. Late and missing ones are counted.
 

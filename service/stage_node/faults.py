@@ -16,11 +16,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.protocol.errors import FieldError
-from service.protocol.keys import Keys
-from service.protocol.samples import MAX_SEQ
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.samples import MAX_SEQ
 
 #: Faults of a reading, and the meaning of ``value``.
 READING: Final = {

@@ -24,19 +24,19 @@ from typing import Any
 
 import zenoh
 
-from service.answers.guard import limit_voltage
-from service.protocol import samples as wire
-from service.protocol.errors import FieldError
-from service.protocol.keys import Keys
-from service.protocol.query import LIMITED_SLEW
-from service.protocol.samples import MAX_SEQ, check_seq
-from service.runtime.session import SURELY
-from service.security.authenticator import own_authenticator
-from service.security.lease import CommandGate
-from service.stage_node.exchange import CommandBuffer, SampleRing, Sender
-from service.stage_node.faults import Injector, fault_key, sound_key
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from dehyst.service.answers.guard import limit_voltage
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import LIMITED_SLEW
+from dehyst.service.protocol.samples import MAX_SEQ, check_seq
+from dehyst.service.runtime.session import SURELY
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.security.lease import CommandGate
+from dehyst.service.stage_node.exchange import CommandBuffer, SampleRing, Sender
+from dehyst.service.stage_node.faults import Injector, fault_key, sound_key
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 
 # --- The node.
 

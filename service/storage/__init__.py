@@ -10,20 +10,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.storage.checkpoint import CheckpointFolder as CheckpointFolder
-    from service.storage.checkpoint import CheckpointKeeper as CheckpointKeeper
-    from service.storage.checkpoint import CheckpointMeta as CheckpointMeta
-    from service.storage.checkpoint import learn_again as learn_again
-    from service.storage.checkpoint import restore_newest as restore_newest
-    from service.storage.model_file import Bundle as Bundle
-    from service.storage.model_file import BundleMeta as BundleMeta
-    from service.storage.model_file import read_bundle as read_bundle
-    from service.storage.model_file import write_bundle as write_bundle
-    from service.storage.output import clear_output as clear_output
-    from service.storage.recorder import Recorder as Recorder
-    from service.storage.recorder import RecorderConfig as RecorderConfig
+    from dehyst.service.storage.checkpoint import CheckpointFolder as CheckpointFolder
+    from dehyst.service.storage.checkpoint import CheckpointKeeper as CheckpointKeeper
+    from dehyst.service.storage.checkpoint import CheckpointMeta as CheckpointMeta
+    from dehyst.service.storage.checkpoint import learn_again as learn_again
+    from dehyst.service.storage.checkpoint import restore_newest as restore_newest
+    from dehyst.service.storage.model_file import Bundle as Bundle
+    from dehyst.service.storage.model_file import BundleMeta as BundleMeta
+    from dehyst.service.storage.model_file import read_bundle as read_bundle
+    from dehyst.service.storage.model_file import write_bundle as write_bundle
+    from dehyst.service.storage.output import clear_output as clear_output
+    from dehyst.service.storage.recorder import Recorder as Recorder
+    from dehyst.service.storage.recorder import RecorderConfig as RecorderConfig
 
 __getattr__ = lazy_names(__name__)

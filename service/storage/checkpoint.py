@@ -18,19 +18,26 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from adaptive.errors import DehystError, ModelFileError
-from adaptive.state import Entry, load
-from adaptive.types import OnlineModel, StateDict, joined, under
-from service.intake.sample_queue import SampleQueue
-from service.operating.server import Switch
-from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_body, decode_header, encode_body, split_state
-from service.protocol.errors import FieldError
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
-from service.storage.output import atomic_write
-from service.storage.owner import FolderOwner
-from service.storage.segments import rows_behind
+from dehyst.adaptive.errors import DehystError, ModelFileError
+from dehyst.adaptive.state import Entry, load
+from dehyst.adaptive.types import OnlineModel, StateDict, joined, under
+from dehyst.service.intake.sample_queue import SampleQueue
+from dehyst.service.operating.server import Switch
+from dehyst.service.protocol.container import (
+    MAX_HEADER_BYTES,
+    UNITS,
+    decode_body,
+    decode_header,
+    encode_body,
+    split_state,
+)
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.learner_supervisor import STATE_SCHEMA, restored_learner
+from dehyst.service.storage.output import atomic_write
+from dehyst.service.storage.owner import FolderOwner
+from dehyst.service.storage.segments import rows_behind
 
 # --- Files.
 

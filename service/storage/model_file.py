@@ -14,12 +14,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.npy_sizes import check_npz
-from adaptive.types import InverseModel, StateDict
-from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_header, encode_header, split_state
-from service.protocol.model import build_model, stored_kind
-from service.storage.output import atomic_write
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.npy_sizes import check_npz
+from dehyst.adaptive.types import InverseModel, StateDict
+from dehyst.service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_header, encode_header, split_state
+from dehyst.service.protocol.model import build_model, stored_kind
+from dehyst.service.storage.output import atomic_write
 
 SCHEMA: Final = 1
 #: Identifies a model file among other .npz files.

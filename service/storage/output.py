@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from adaptive.errors import InputError
+from dehyst.adaptive.errors import InputError
 
 # --- Atomic file writing: a reader sees the old file or the new one, never a part.
 

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from service.protocol.errors import FieldError
+from dehyst.service.protocol.errors import FieldError
 
 #: Pause between two tries to hold a folder, s.
 _PAUSE_S: Final = 0.05

@@ -21,9 +21,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from service.protocol.errors import FieldError
-from service.storage.owner import FolderOwner
-from service.storage.segments import (
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.storage.owner import FolderOwner
+from dehyst.service.storage.segments import (
     LOCK,
     RECORD,
     Closer,

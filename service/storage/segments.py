@@ -5,9 +5,9 @@ therefore a journal. Closing it writes a Parquet file under a temporary name, sy
 the newest closed segment stays until the next segment is closed: a restart learns the samples after its checkpoint from
 it.
 
-``python -m service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it as a
-process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service; at
-its end it closes them itself.
+``python -m dehyst.service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it
+as a process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service;
+at its end it closes them itself.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray
-from service.background.job import step_back
-from service.protocol.errors import FieldError
-from service.storage.output import PART, atomic_write
-from service.storage.owner import FolderOwner, is_still_at, owner_of
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.background.job import step_back
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.storage.output import PART, atomic_write
+from dehyst.service.storage.owner import FolderOwner, is_still_at, owner_of
 
 # --- The journal of a recording: samples appended as rows of fixed size, readable up to the last row after any crash.
 #
@@ -278,7 +278,7 @@ class Closer:
         root = Path(__file__).resolve().parents[2]
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "service.storage.segments", str(directory), str(but or _NONE)],
+            [sys.executable, "-m", "dehyst.service.storage.segments", str(directory), str(but or _NONE)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -10,20 +10,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.viewer.consumer import Consumer as Consumer
-    from service.viewer.consumer import ConsumerConfig as ConsumerConfig
-    from service.viewer.output import Output as Output
-    from service.viewer.output import OutputConfig as OutputConfig
-    from service.viewer.records import Diagnostics as Diagnostics
-    from service.viewer.records import Event as Event
-    from service.viewer.records import Health as Health
-    from service.viewer.records import Record as Record
-    from service.viewer.records import SceneConfig as SceneConfig
-    from service.viewer.records import Status as Status
-    from service.viewer.records import Tracking as Tracking
-    from service.viewer.rerun_sink import write_recording as write_recording
+    from dehyst.service.viewer.consumer import Consumer as Consumer
+    from dehyst.service.viewer.consumer import ConsumerConfig as ConsumerConfig
+    from dehyst.service.viewer.output import Output as Output
+    from dehyst.service.viewer.output import OutputConfig as OutputConfig
+    from dehyst.service.viewer.records import Diagnostics as Diagnostics
+    from dehyst.service.viewer.records import Event as Event
+    from dehyst.service.viewer.records import Health as Health
+    from dehyst.service.viewer.records import Record as Record
+    from dehyst.service.viewer.records import SceneConfig as SceneConfig
+    from dehyst.service.viewer.records import Status as Status
+    from dehyst.service.viewer.records import Tracking as Tracking
+    from dehyst.service.viewer.rerun_sink import write_recording as write_recording
 
 __getattr__ = lazy_names(__name__)

@@ -17,12 +17,12 @@ from typing import Any, Protocol, TypeGuard
 import numpy as np
 import zenoh
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.security.authenticator import own_authenticator
-from service.viewer.records import Diagnostics, Event, Health, IntArray, Record, Status, Tracking, event_record
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.viewer.records import Diagnostics, Event, Health, IntArray, Record, Status, Tracking, event_record
 
 # --- Samples and their references
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.viewer import style
-from service.viewer.records import SceneConfig
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.viewer import style
+from dehyst.service.viewer.records import SceneConfig
 
 # --- A plane with axes
 #

@@ -23,10 +23,10 @@ from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Final
 
-from adaptive.errors import InputError
-from service.background.job import step_back
-from service.protocol.errors import ServiceError
-from service.viewer.records import Record, SceneConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.service.background.job import step_back
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.viewer.records import Record, SceneConfig
 
 #: How long a child may take to start, s: it imports Rerun and numpy.
 START_S = 60.0
@@ -141,8 +141,8 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
     step_back(_NICE)
-    from service.viewer.rerun_sink import RerunSink
-    from service.viewer.scene import Scene
+    from dehyst.service.viewer.rerun_sink import RerunSink
+    from dehyst.service.viewer.scene import Scene
 
     if config.connect is not None:
         greeting.send("")  # Do not wait for the connection: a stuck viewer blocks it.

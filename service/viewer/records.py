@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 

@@ -13,13 +13,13 @@ from urllib.parse import quote
 import rerun as rr
 import rerun.blueprint as rrb
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.protocol.errors import ServiceError
-from service.viewer import style
-from service.viewer.layout import Box, Part, PlaneView, Plot, layout
-from service.viewer.records import Event, IntArray, Record, SceneConfig, Tracking
-from service.viewer.scene import Scene
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.viewer import style
+from dehyst.service.viewer.layout import Box, Part, PlaneView, Plot, layout
+from dehyst.service.viewer.records import Event, IntArray, Record, SceneConfig, Tracking
+from dehyst.service.viewer.scene import Scene
 
 # --- The only module that knows Rerun: a canvas that draws into a viewer or an ``.rrd`` file.
 #

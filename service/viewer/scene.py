@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.viewer import style
-from service.viewer.layout import Plane, grown
-from service.viewer.records import (
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.viewer import style
+from dehyst.service.viewer.layout import Plane, grown
+from dehyst.service.viewer.records import (
     Diagnostics,
     Event,
     Health,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.viewer.colours import MODELS, rgb
-from service.viewer.records import SceneConfig
+from dehyst.service.viewer.colours import MODELS, rgb
+from dehyst.service.viewer.records import SceneConfig
 
 Colour = tuple[int, int, int]
 

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adaptive.lazy_names import lazy_names
+from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from sim.chapter.control import run_control as run_control
-    from sim.chapter.control import track_learning as track_learning
-    from sim.chapter.experiments import Experiments as Experiments
-    from sim.chapter.experiments import Record as Record
-    from sim.chapter.experiments import Score as Score
-    from sim.chapter.experiments import characterise as characterise
-    from sim.chapter.modelling import identify_forward as identify_forward
+    from dehyst.sim.chapter.control import run_control as run_control
+    from dehyst.sim.chapter.control import track_learning as track_learning
+    from dehyst.sim.chapter.experiments import Experiments as Experiments
+    from dehyst.sim.chapter.experiments import Record as Record
+    from dehyst.sim.chapter.experiments import Score as Score
+    from dehyst.sim.chapter.experiments import characterise as characterise
+    from dehyst.sim.chapter.modelling import identify_forward as identify_forward
 
 __getattr__ = lazy_names(__name__)

@@ -8,21 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.identification import identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
-from baselines import fit_bouc_wen, fit_mpi
-from baselines.competition.competition import online_form
-from sim.chapter.experiments import DT_S, Experiments, Record, Score
-from sim.effects import effect
-from sim.signals.references import Reference, blend_step, demo_reference
-from sim.signals.voltages import sample_times
-from sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage, StageState
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.identification import identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.smoothing import SmootherConfig, smooth_recording
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from dehyst.baselines import fit_bouc_wen, fit_mpi
+from dehyst.baselines.competition.competition import online_form
+from dehyst.sim.chapter.experiments import DT_S, Experiments, Record, Score
+from dehyst.sim.effects import effect
+from dehyst.sim.signals.references import Reference, blend_step, demo_reference
+from dehyst.sim.signals.voltages import sample_times
+from dehyst.sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage, StageState
 
 # --- Control and replay with a model that learns while it serves, in one process and without a clock.
 #

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.signals import voltages
-from sim.stage.config import StageConfig
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.signals import voltages
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- The records that every model of the reproduction is identified on and scored by.
 #

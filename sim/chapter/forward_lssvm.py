@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive import lssvm
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.identification import IdentifyConfig, design_features, prior_deviations
-from adaptive.lssvm import LssvmModel
-from adaptive.smoothing import backward_difference
-from adaptive.tuning.evidence import Evidence, evidence_samples
-from adaptive.tuning.search import InferenceConfig, infer
-from adaptive.types import FloatArray, StateDict
-from sim.chapter.experiments import DT_S, EVERY
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.identification import IdentifyConfig, design_features, prior_deviations
+from dehyst.adaptive.lssvm import LssvmModel
+from dehyst.adaptive.smoothing import backward_difference
+from dehyst.adaptive.tuning.evidence import Evidence, evidence_samples
+from dehyst.adaptive.tuning.search import InferenceConfig, infer
+from dehyst.adaptive.types import FloatArray, StateDict
+from dehyst.sim.chapter.experiments import DT_S, EVERY
 
 # --- Min-max normalisation of features and targets, (2.42), with its inverse.
 

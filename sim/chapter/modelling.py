@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.bouc_wen.identify import identify_bouc_wen
-from baselines.bouc_wen.model import BoucWenParameters
-from baselines.prandtl_ishlinskii.identify import identify_mpi
-from baselines.prandtl_ishlinskii.model import MpiParameters
-from baselines.swarm.identification import SwarmConfig, swarm_bouc_wen, swarm_mpi
-from sim.chapter import published
-from sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
-from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.identify import identify_bouc_wen
+from dehyst.baselines.bouc_wen.model import BoucWenParameters
+from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
+from dehyst.baselines.swarm.identification import SwarmConfig, swarm_bouc_wen, swarm_mpi
+from dehyst.sim.chapter import published
+from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
+from dehyst.sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs
 
 # --- Bouc-Wen stage identified from 500 displacements with the voltage known between them.
 #

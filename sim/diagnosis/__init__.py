@@ -3,20 +3,20 @@
 `prepare` checks a recording; `diagnose_prepared` calibrates a nominal stage, searches for causes and returns a
 `Diagnosis`; `export_stage` turns it into a stage file.
 
-    from sim.diagnosis import diagnose_prepared, export_stage, prepare
-    from sim.recordings import read
+    from dehyst.sim.diagnosis import diagnose_prepared, export_stage, prepare
+    from dehyst.sim.recordings import read
 
     diagnosis = diagnose_prepared(prepare(read(path)))
     print(diagnosis.verdict, [cause.name for cause in diagnosis.causes])
     stage = export_stage(diagnosis).config
 """
 
-from sim.diagnosis.diagnose import Options, diagnose, diagnose_prepared
-from sim.diagnosis.export import ExportedStage, export_stage
-from sim.diagnosis.prepare import Prepared, prepare
-from sim.diagnosis.result import Diagnosis, NamedCause
-from sim.diagnosis.search.search import Thresholds
-from sim.fitting.fit_data import FitData
+from dehyst.sim.diagnosis.diagnose import Options, diagnose, diagnose_prepared
+from dehyst.sim.diagnosis.export import ExportedStage, export_stage
+from dehyst.sim.diagnosis.prepare import Prepared, prepare
+from dehyst.sim.diagnosis.result import Diagnosis, NamedCause
+from dehyst.sim.diagnosis.search.search import Thresholds
+from dehyst.sim.fitting.fit_data import FitData
 
 __all__ = [
     "Diagnosis",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from adaptive.errors import InputError
-from sim.effects import CAUSES, Cause, Kind
-from sim.fitting.stage_model import CauseModel
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.effects import CAUSES, Cause, Kind
+from dehyst.sim.fitting.stage_model import CauseModel
 
 
 @dataclass(frozen=True)

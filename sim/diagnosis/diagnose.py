@@ -6,28 +6,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.lapack import one_thread
-from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.catalogue import CATALOGUE, Catalogue
-from sim.diagnosis.next_experiment import Rival, next_experiment
-from sim.diagnosis.nominal import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from dehyst.sim.diagnosis.next_experiment import Rival, next_experiment
+from dehyst.sim.diagnosis.nominal import (
     calibrate_nominal,
     fit_on_other_recording,
     with_nominal_kind,
     with_other_axis,
 )
-from sim.diagnosis.prepare import Prepared
-from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
-from sim.diagnosis.search.held_out import HeldOut, split
-from sim.diagnosis.search.intervals import numbers, over_ties, parameter_errors
-from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
-from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
-from sim.diagnosis.witnesses import witnesses
-from sim.fitting.calibration import calibrate, with_new_columns
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import ModelFit
-from sim.readings.noise import (
+from dehyst.sim.diagnosis.prepare import Prepared
+from dehyst.sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
+from dehyst.sim.diagnosis.search.held_out import HeldOut, split
+from dehyst.sim.diagnosis.search.intervals import numbers, over_ties, parameter_errors
+from dehyst.sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
+from dehyst.sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
+from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.fitting.calibration import calibrate, with_new_columns
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import ModelFit
+from dehyst.sim.readings.noise import (
     ConverterGrid,
     NoiseFloor,
     converter_grid,
@@ -36,9 +36,9 @@ from sim.readings.noise import (
     recording_defects,
     repeated_readings,
 )
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
-from sim.stage.config import StageConfig
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
+from dehyst.sim.stage.config import StageConfig
 
 
 def _silent(stage: str, share: float) -> None:

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.diagnosis.nominal import BoucWenStage, FileStage, LinearStage
-from sim.diagnosis.result import Diagnosis
-from sim.effects import EFFECTS, Chain, Effect, simulate
-from sim.fitting.calibration import DampingRule, damped_step
-from sim.fitting.fit_data import ActsOn, FitData
-from sim.fitting.hysteresis_loops import loop_numbers
-from sim.fitting.stage_model import ModelFit, StageModel
-from sim.stage.config import StageConfig
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.nominal import BoucWenStage, FileStage, LinearStage
+from dehyst.sim.diagnosis.result import Diagnosis
+from dehyst.sim.effects import EFFECTS, Chain, Effect, simulate
+from dehyst.sim.fitting.calibration import DampingRule, damped_step
+from dehyst.sim.fitting.fit_data import ActsOn, FitData
+from dehyst.sim.fitting.hysteresis_loops import loop_numbers
+from dehyst.sim.fitting.stage_model import ModelFit, StageModel
+from dehyst.sim.stage.config import StageConfig
 
 #: Label of the effect that carries the sensor's offset.
 OFFSET = "sensor_offset"

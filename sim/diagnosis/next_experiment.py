@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.diagnosis.catalogue import Catalogue
-from sim.diagnosis.witnesses import witnesses
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
-from sim.readings.readings import Readings
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.catalogue import Catalogue
+from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import CauseModel, ModelFit, StageModel
+from dehyst.sim.readings.readings import Readings
 
 #: Resolution of a voltage monitor relative to the swing.
 MONITOR_NOISE = 2e-4

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray
-from sim.effects import Chain, Effect, effect, simulate
-from sim.effects.base import Place
-from sim.fitting.calibration import calibrate, with_dynamics_anew, with_free_memory
-from sim.fitting.dynamics import LIGHT, Dynamics, first_ringing, respond
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
-from sim.fitting.stage_model import INITIAL_STATE, ModelFit, NominalStage, StageModel
-from sim.stage.config import StageConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.effects import Chain, Effect, effect, simulate
+from dehyst.sim.effects.base import Place
+from dehyst.sim.fitting.calibration import calibrate, with_dynamics_anew, with_free_memory
+from dehyst.sim.fitting.dynamics import LIGHT, Dynamics, first_ringing, respond
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
+from dehyst.sim.fitting.stage_model import INITIAL_STATE, ModelFit, NominalStage, StageModel
+from dehyst.sim.stage.config import StageConfig
 
 
 def common_parameters(data: FitData) -> tuple[ModelParameter, ModelParameter]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.nominal import NAMED
-from sim.fitting.fit_data import FitData
-from sim.recordings import Finding, Recording, check, repaired, require_usable
-from sim.stage.config import StageConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.diagnosis.nominal import NAMED
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.recordings import Finding, Recording, check, repaired, require_usable
+from dehyst.sim.stage.config import StageConfig
 
 #: A longer recording is cut to its first samples, so that memory stays below 1 GB.
 MOST_SAMPLES = 200_000

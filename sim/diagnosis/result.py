@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.diagnosis.catalogue import CATALOGUE, Catalogue
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import ModelFit
-from sim.pictures import Picture, over_time
-from sim.readings.noise import Defect
-from sim.readings.sight import Sight
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import ModelFit
+from dehyst.sim.pictures import Picture, over_time
+from dehyst.sim.readings.noise import Defect
+from dehyst.sim.readings.sight import Sight
 
 #: Schemas of report.json. 1 has no verdict "partly", no witnesses, no ceiling and no defects.
 SCHEMAS = (1, 2)

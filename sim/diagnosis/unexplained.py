@@ -11,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import BoolArray, FloatArray
-from baselines.prandtl_ishlinskii.operators import play_run
-from sim.diagnosis.search.held_out import Split
-from sim.fitting.lags import lag_ends, slow_poles
-from sim.fitting.parallel import side_by_side
-from sim.fitting.stage_model import ModelFit
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.sim.diagnosis.search.held_out import Split
+from dehyst.sim.fitting.lags import lag_ends, slow_poles
+from dehyst.sim.fitting.parallel import side_by_side
+from dehyst.sim.fitting.stage_model import ModelFit
 
 IntArray = NDArray[np.int64]
 

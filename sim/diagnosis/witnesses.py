@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sim.diagnosis.catalogue import CATALOGUE, Catalogue
-from sim.fitting.parallel import side_by_side
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
+from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from dehyst.sim.fitting.parallel import side_by_side
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
 
 
 def witnesses(readings: Readings, catalogue: Catalogue = CATALOGUE) -> dict[str, Sight]:

@@ -11,9 +11,9 @@ import importlib
 import pkgutil
 from types import MappingProxyType
 
-from adaptive.errors import InputError
-from sim.effects.base import Block, Cause, Chain, Context, Effect, Kind, Parameter, Place, block
-from sim.effects.simulation import Plan, plan, simulate
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.effects.base import Block, Cause, Chain, Context, Effect, Kind, Parameter, Place, block
+from dehyst.sim.effects.simulation import Plan, plan, simulate
 
 
 def _find() -> dict[str, Kind]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from baselines.bouc_wen.step import hysteresis_step
-from sim.effects.base import Context, Kind, Parameter, Place, block
+from dehyst.baselines.bouc_wen.step import hysteresis_step
+from dehyst.sim.effects.base import Context, Kind, Parameter, Place, block
 
 # --- linear_actuator ---
 # An actuator without hysteresis: displacement in proportion to voltage.

@@ -20,16 +20,16 @@ import numba
 import numpy as np
 from numba import types
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import CauseModel
-from sim.pictures import Draw, over_time
-from sim.readings.sight import Sight
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import CauseModel
+from dehyst.sim.pictures import Draw, over_time
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.noise import ConverterGrid
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.noise import ConverterGrid
+    from dehyst.sim.readings.readings import Readings
 
 _types: Any = types
 _cfunc: Any = numba.cfunc
@@ -141,7 +141,7 @@ def _no_state(values: Mapping[str, float], context: Context) -> Sequence[float]:
 
 def _kind_named(name: str) -> Kind:
     """The kind ``name`` of the library. Pickled kinds are loaded by it."""
-    kind: Kind = importlib.import_module("sim.effects").EFFECTS[name]
+    kind: Kind = importlib.import_module("dehyst.sim.effects").EFFECTS[name]
     return kind
 
 

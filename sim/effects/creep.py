@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.effects.holds import first_order
-from sim.fitting.fit_data import ActsOn, FitData, LastResultCache, ModelParameter
-from sim.fitting.lags import slow_poles
-from sim.fitting.stage_model import CauseModel, Guess
-from sim.readings.sight import Sight
-from sim.readings.slow_motion import cycles_over_time, rests_over_time
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.holds import first_order
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, LastResultCache, ModelParameter
+from dehyst.sim.fitting.lags import slow_poles
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
+from dehyst.sim.readings.sight import Sight
+from dehyst.sim.readings.slow_motion import cycles_over_time, rests_over_time
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

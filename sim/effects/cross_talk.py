@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim import pictures
-from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.dynamics import Dynamics
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.modes import MOST, Mode, Modes, modal_response, peaks
-from sim.fitting.stage_model import CauseModel, ModelFit
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.dynamics import Dynamics
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.modes import MOST, Mode, Modes, modal_response, peaks
+from dehyst.sim.fitting.stage_model import CauseModel, ModelFit
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim.effects.base import Context, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Context, Kind, Parameter, Place, block
 
 
 @block

@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from adaptive.compiled import compiled
-from sim.effects.base import Context, Kind, Parameter, Place, block
+from dehyst.adaptive.compiled import compiled
+from dehyst.sim.effects.base import Context, Kind, Parameter, Place, block
 
 
 @compiled

@@ -18,9 +18,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from baselines.bouc_wen.step import hysteresis_step
-from sim.effects.base import Context, Kind, Parameter, Place, block
-from sim.effects.holds import second_order
+from dehyst.baselines.bouc_wen.step import hysteresis_step
+from dehyst.sim.effects.base import Context, Kind, Parameter, Place, block
+from dehyst.sim.effects.holds import second_order
 
 
 @block

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sim import pictures
-from sim.effects.base import Cause, Effect, FoundInReadings, InReadings, Kind, Parameter, Place, block
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Effect, FoundInReadings, InReadings, Kind, Parameter, Place, block
 
 if TYPE_CHECKING:
-    from sim.readings.noise import ConverterGrid
+    from dehyst.sim.readings.noise import ConverterGrid
 
 
 @block

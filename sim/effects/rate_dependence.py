@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.hysteresis_loops import (
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.hysteresis_loops import (
     bouc_wen_paced,
     filtered_rate,
     grown_plays,
     loop_numbers,
 )
-from sim.fitting.stage_model import CauseModel, Guess
-from sim.readings.cycles import loop_widths
-from sim.readings.sight import Sight
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
+from dehyst.sim.readings.cycles import loop_widths
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
-from sim.effects.holds import second_order
-from sim.effects.mechanics import run_mode
-from sim.fitting.dynamics import Dynamics
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.modes import Modes
-from sim.fitting.stage_model import CauseModel, Guess
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
+from dehyst.sim.effects.holds import second_order
+from dehyst.sim.effects.mechanics import run_mode
+from dehyst.sim.fitting.dynamics import Dynamics
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.modes import Modes
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

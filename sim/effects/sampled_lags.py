@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import FloatArray
-from sim.effects.slew_limit import seen as speed_is_limited
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.effects.slew_limit import seen as speed_is_limited
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.fitting.fit_data import FitData
-    from sim.readings.readings import Readings, Response
+    from dehyst.sim.fitting.fit_data import FitData
+    from dehyst.sim.readings.readings import Readings, Response
 
 
 ComplexArray = NDArray[np.complex128]

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel, Guess
-from sim.masks import samples_since
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
+from dehyst.sim.masks import samples_since
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.effects.holds import first_order
-from sim.effects.sampled_lags import agrees, apart, is_of_the_recorder, second_lag
-from sim.fitting.dynamics import Dynamics
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel, Guess, single_guesses
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.holds import first_order
+from dehyst.sim.effects.sampled_lags import agrees, apart, is_of_the_recorder, second_lag
+from dehyst.sim.fitting.dynamics import Dynamics
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 # Its step in the simulation.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sim.effects.base import Kind, Parameter, Place, block
-from sim.effects.counter_noise import normal
+from dehyst.sim.effects.base import Kind, Parameter, Place, block
+from dehyst.sim.effects.counter_noise import normal
 
 
 @block

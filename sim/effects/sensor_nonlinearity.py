@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel
-from sim.readings.cycles import mirrored_branches
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel
+from dehyst.sim.readings.cycles import mirrored_branches
 
 # Its step in the simulation.
 

@@ -17,11 +17,11 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from adaptive.compiled import compiled
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.effects.base import SENSOR_FROM, Chain, Context, Place
-from sim.effects.counter_noise import stream
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.effects.base import SENSOR_FROM, Chain, Context, Place
+from dehyst.sim.effects.counter_noise import stream
 
 IntArray = NDArray[np.int64]
 _intrinsic: Any = intrinsic

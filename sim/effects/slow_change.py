@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.fitting.drifts import Drift, spline
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import CauseModel
-from sim.readings.slow_motion import Change
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.fitting.drifts import Drift, spline
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import CauseModel
+from dehyst.sim.readings.slow_motion import Change
 
 #: Knots (shares of the duration) for a change that is fast at first: a temperature settles as the root of time.
 _EARLY = np.array([0.0, 0.02, 0.045, 0.08, 0.13, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])

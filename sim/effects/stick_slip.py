@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.hysteresis_loops import plays_nested
-from sim.fitting.stage_model import CauseModel, Guess
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.hysteresis_loops import plays_nested
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
 
 # Its step in the simulation.
 

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.effects.counter_noise import normal
-from sim.effects.slow_change import SlowChange
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel
-from sim.readings.sight import Sight
-from sim.readings.slow_motion import cycles_over_time, rests_over_time
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.counter_noise import normal
+from dehyst.sim.effects.slow_change import SlowChange
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel
+from dehyst.sim.readings.sight import Sight
+from dehyst.sim.readings.slow_motion import cycles_over_time, rests_over_time
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.

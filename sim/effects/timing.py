@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.compiled import compiled
-from adaptive.types import BoolArray, FloatArray
-from sim import pictures
-from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
-from sim.effects.counter_noise import uniform
-from sim.fitting.calibration import calibrate, evaluate
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.lags import resample_by
-from sim.fitting.stage_model import CauseModel, Guess, ModelFit, StageModel, single_guesses
-from sim.readings.sight import Sight
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.counter_noise import uniform
+from dehyst.sim.fitting.calibration import calibrate, evaluate
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.lags import resample_by
+from dehyst.sim.fitting.stage_model import CauseModel, Guess, ModelFit, StageModel, single_guesses
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.lateness import SlipList
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.lateness import SlipList
+    from dehyst.sim.readings.readings import Readings
 
 
 # Its step in the simulation.
@@ -485,7 +485,7 @@ def change_of_lateness(readings: Readings) -> LatenessChange:
     """
     from scipy import stats  # a simulated stage waits for neither
 
-    from sim.readings.lateness import lateness
+    from dehyst.sim.readings.lateness import lateness
 
     data = readings.data
     t, d, e = readings.lateness

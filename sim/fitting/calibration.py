@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.fit_data import ActsOn, ModelParameter
-from sim.fitting.stage_model import JacobianColumns, ModelFit, StageModel
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.fit_data import ActsOn, ModelParameter
+from dehyst.sim.fitting.stage_model import JacobianColumns, ModelFit, StageModel
 
 IntArray = NDArray[np.int64]
 T = TypeVar("T")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import CauseModel
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import CauseModel
 
 
 @dataclass(frozen=True)

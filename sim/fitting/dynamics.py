@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
-from baselines.bouc_wen.step import hysteresis_step
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.step import hysteresis_step
 
 
 @compiled

@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim.masks import samples_since, samples_until
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.masks import samples_since, samples_until
 
 T = TypeVar("T")
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from adaptive.compiled import compiled
-from adaptive.types import FloatArray
+from dehyst.adaptive.compiled import compiled
+from dehyst.adaptive.types import FloatArray
 
 
 @compiled

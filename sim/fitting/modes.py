@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.dynamics import Dynamics, respond_partial
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel, Guess, ModelFit
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.dynamics import Dynamics, respond_partial
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, Guess, ModelFit
 
 #: Least share of the residual's power that a mode explains.
 LEAST = 0.004

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.dynamics import Dynamics, RestoringForce, changed_midway, respond
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.parallel import side_by_side
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.dynamics import Dynamics, RestoringForce, changed_midway, respond
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.parallel import side_by_side
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Readings
+    from dehyst.sim.readings.readings import Readings
 
 
 class NominalStage(Protocol):

@@ -1,6 +1,6 @@
 """Modes of a stage from periodic recordings: several drives, outputs, realisations, periods and amplitudes in one fit.
 
-    from sim.modal import PeriodicRecord, study
+    from dehyst.sim.modal import PeriodicRecord, study
     found = study([PeriodicRecord("100 mV", u_V, y_um, dt_s), ...], tests=[...])
     print(found.levels[0].test_um, [mode.sentence(0.1, 0.3) for mode in found.modes])
 
@@ -8,9 +8,9 @@
 predicts, ``fit`` fits, ``study`` judges and names, ``reading`` reads files.
 """
 
-from sim.modal.fit import FitSettings, ModalFit, fit_modes
-from sim.modal.model import ModalModel, output_errors
-from sim.modal.periods import (
+from dehyst.sim.modal.fit import FitSettings, ModalFit, fit_modes
+from dehyst.sim.modal.model import ModalModel, output_errors
+from dehyst.sim.modal.periods import (
     FrequencyResponse,
     LineSpectra,
     PeriodicRecord,
@@ -18,7 +18,7 @@ from sim.modal.periods import (
     cut_into_periods,
     frequency_response,
 )
-from sim.modal.study import Level, ModalStudy, Mode, study
+from dehyst.sim.modal.study import Level, ModalStudy, Mode, study
 
 __all__ = [
     "FitSettings",

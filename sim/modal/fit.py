@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray, IntArray
-from sim.modal.model import ModalModel, basis, poles_at, powers_of, stacked, vector_fit
-from sim.modal.periods import ComplexArray, FrequencyResponse
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.sim.modal.model import ModalModel, basis, poles_at, powers_of, stacked, vector_fit
+from dehyst.sim.modal.periods import ComplexArray, FrequencyResponse
 
 #: Powers of 1/z beside the modes: the direct term and what the anti-alias filter adds beyond the band.
 DIRECT: Final = 4

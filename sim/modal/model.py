@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.modal.periods import ComplexArray, LineSpectra
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.modal.periods import ComplexArray, LineSpectra
 
 # --- Common poles of a response matrix by vector fitting: the start of the joint fit.
 #

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray, IntArray
 
 ComplexArray = NDArray[np.complex128]
 

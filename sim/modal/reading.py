@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.modal.periods import PeriodicRecord, cut_into_periods
-from sim.recordings import ColumnMap
-from sim.recordings.columns import default_column, factor_and_unit
-from sim.recordings.reader import read_table, sample_times
-from sim.recordings.table import Table
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.modal.periods import PeriodicRecord, cut_into_periods
+from dehyst.sim.recordings import ColumnMap
+from dehyst.sim.recordings.columns import default_column, factor_and_unit
+from dehyst.sim.recordings.reader import read_table, sample_times
+from dehyst.sim.recordings.table import Table
 
 #: The quantities that are drives, and those that are outputs.
 DRIVES = ("u", "u2", "u3")

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.modal.fit import QUANTILE_95, FitSettings, ModalFit, fit_modes, refitted
-from sim.modal.model import output_errors, powers_of
-from sim.modal.periods import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.modal.fit import QUANTILE_95, FitSettings, ModalFit, fit_modes, refitted
+from dehyst.sim.modal.model import output_errors, powers_of
+from dehyst.sim.modal.periods import (
     FrequencyResponse,
     LineSpectra,
     PeriodicRecord,

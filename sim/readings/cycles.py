@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Cycle, Readings
+    from dehyst.sim.readings.readings import Cycle, Readings
 
 
 _GRID = np.linspace(-0.94, 0.94, 48)

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from baselines.prandtl_ishlinskii.operators import play_run
-from sim.fitting.fit_data import FitData
-from sim.fitting.lags import resample_by, slow_poles
-from sim.readings.readings import RADII, Readings
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.lags import resample_by, slow_poles
+from dehyst.sim.readings.readings import RADII, Readings
 
 #: Standard errors from which a step or a ramp counts.
 _SIGMAS = 5.0

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.fit_data import FitData
-from sim.masks import runs
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.masks import runs
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray, IntArray
-from baselines.prandtl_ishlinskii.operators import play_run
-from sim.fitting.fit_data import EARLY_S, DerivedArrays, FitData
-from sim.fitting.lags import lag_ends
-from sim.masks import runs, samples_since, samples_until
+from dehyst.adaptive.types import BoolArray, FloatArray, IntArray
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.sim.fitting.fit_data import EARLY_S, DerivedArrays, FitData
+from dehyst.sim.fitting.lags import lag_ends
+from dehyst.sim.masks import runs, samples_since, samples_until
 
 T = TypeVar("T")
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from adaptive.types import FloatArray
-from baselines.prandtl_ishlinskii.operators import play_run
-from sim.fitting.fit_data import FitData
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.sim.fitting.fit_data import FitData
 
 #: Stretches of a record, and samples that one needs at least.
 _STRETCHES, _LEAST_SAMPLES = 20, 300

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from adaptive.types import FloatArray
-from sim.fitting.lags import slow_poles
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.fitting.lags import slow_poles
 
 if TYPE_CHECKING:
-    from sim.readings.readings import Cycle, Readings
+    from dehyst.sim.readings.readings import Cycle, Readings
 
 
 #: Time constants (s) of the slow motion that a rest may show after the moves before it.

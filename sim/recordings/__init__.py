@@ -4,10 +4,10 @@
 refuses what cannot be used, and ``repaired`` puts the rest on a regular time grid.
 """
 
-from sim.recordings.columns import ColumnMap, load_map
-from sim.recordings.findings import Finding, check, require_usable
-from sim.recordings.reader import read
-from sim.recordings.recording import Recording
-from sim.recordings.repair import Repaired, repaired
+from dehyst.sim.recordings.columns import ColumnMap, load_map
+from dehyst.sim.recordings.findings import Finding, check, require_usable
+from dehyst.sim.recordings.reader import read
+from dehyst.sim.recordings.recording import Recording
+from dehyst.sim.recordings.repair import Repaired, repaired
 
 __all__ = ["ColumnMap", "Finding", "Recording", "Repaired", "check", "load_map", "read", "repaired", "require_usable"]

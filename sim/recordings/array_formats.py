@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.npy_sizes import check_npy, check_npz
-from sim.recordings.columns import ColumnMap
-from sim.recordings.delimited_text import read_lines
-from sim.recordings.matlab_process import MOST_ELEMENTS, as_text
-from sim.recordings.table import MAX_BYTES, Table, plain_arrays
-from sim.recordings.text_formats import from_arrow
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.npy_sizes import check_npy, check_npz
+from dehyst.sim.recordings.columns import ColumnMap
+from dehyst.sim.recordings.delimited_text import read_lines
+from dehyst.sim.recordings.matlab_process import MOST_ELEMENTS, as_text
+from dehyst.sim.recordings.table import MAX_BYTES, Table, plain_arrays
+from dehyst.sim.recordings.text_formats import from_arrow
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: MATLAB puts a text header of this length before the HDF5 data of version 7.3.

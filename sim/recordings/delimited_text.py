@@ -18,11 +18,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
-from sim.recordings.table import MAX_BYTES, Table, seconds
-from sim.recordings.text_formats import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
+from dehyst.sim.recordings.table import MAX_BYTES, Table, seconds
+from dehyst.sim.recordings.text_formats import (
     different,
     encoding_of,
     has_names,

@@ -12,11 +12,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.masks import runs
-from sim.recordings.recording import Recording
-from sim.recordings.repair import dropout_mask, repeat_mask
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.masks import runs
+from dehyst.sim.recordings.recording import Recording
+from dehyst.sim.recordings.repair import dropout_mask, repeat_mask
 
 Severity = Literal["note", "warning", "refusal"]
 

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from sim.recordings.table import Table
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings.table import Table
 
 #: Words in front of a unit and of a name, in lower case.
 _UNIT: Final = ("unit", "units", "egu")

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.recordings.columns import (
+from dehyst.sim.recordings.columns import (
     QUANTITIES,
     TIME_WORDS,
     may_be,
@@ -21,8 +21,8 @@ from sim.recordings.columns import (
     stated_unit,
     unit_of_name,
 )
-from sim.recordings.findings import on_a_line, swapped
-from sim.recordings.table import Table
+from dehyst.sim.recordings.findings import on_a_line, swapped
+from dehyst.sim.recordings.table import Table
 
 #: An array of two dimensions may be columns where one dimension is at most so long and the other so many times longer.
 _MOST_COLUMNS, _TIMES_LONGER = 16, 10

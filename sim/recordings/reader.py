@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.recordings import array_formats as arrays
-from sim.recordings import delimited_text, json_arrays
-from sim.recordings import text_formats as text
-from sim.recordings.columns import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.recordings import array_formats as arrays
+from dehyst.sim.recordings import delimited_text, json_arrays
+from dehyst.sim.recordings import text_formats as text
+from dehyst.sim.recordings.columns import (
     KELVIN_AT_0_C,
     QUANTITIES,
     SAMPLED,
@@ -29,7 +29,7 @@ from sim.recordings.columns import (
     factor_and_unit,
     is_angle,
 )
-from sim.recordings.proposals import (
+from dehyst.sim.recordings.proposals import (
     Candidate,
     exchanged,
     in_another_file,
@@ -38,8 +38,8 @@ from sim.recordings.proposals import (
     only_signal,
     other_channel,
 )
-from sim.recordings.recording import Recording
-from sim.recordings.table import MAX_BYTES, Table
+from dehyst.sim.recordings.recording import Recording
+from dehyst.sim.recordings.table import MAX_BYTES, Table
 
 #: Two clocks agree within this share of a sample time.
 CLOCK_TOLERANCE = 0.01

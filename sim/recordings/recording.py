@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 #: Columns that every recording has, and columns that it may have.
 REQUIRED = ("t_s", "u_V", "y_um")

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray
-from sim.masks import runs
-from sim.recordings.recording import OPTIONAL, Recording
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.masks import runs
+from dehyst.sim.recordings.recording import OPTIONAL, Recording
 
 #: Longest gap that is filled, samples. A longer one ends the usable stretch, because hysteresis remembers what happened
 #: in it.

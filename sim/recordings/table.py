@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 #: Largest content of a file when unpacked, bytes; more does not fit into the memory of common machines.
 MAX_BYTES = 2_000_000_000

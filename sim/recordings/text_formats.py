@@ -13,9 +13,9 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from sim.recordings.columns import ColumnMap, is_unit
-from sim.recordings.table import Table, seconds
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings.columns import ColumnMap, is_unit
+from dehyst.sim.recordings.table import Table, seconds
 
 
 def has_names(source: str, cells: list[str], mapping: ColumnMap, number: int) -> bool:

@@ -1,7 +1,7 @@
 """Signals for simulated stages: ``voltages`` to apply, ``references`` to follow, and ``sample_times``."""
 
-from sim.signals.references import DemoReference, Motion, Reference, demo_reference
-from sim.signals.voltages import (
+from dehyst.sim.signals.references import DemoReference, Motion, Reference, demo_reference
+from dehyst.sim.signals.voltages import (
     CHAPTER_AMPLITUDE_V,
     generalisation_input,
     growing_triangles,

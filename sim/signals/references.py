@@ -16,9 +16,9 @@ from typing import Protocol
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.signals.voltages import sample_times
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.signals.voltages import sample_times
 
 #: Duration of the blend from one part to the next, s.
 BLEND_S = 0.6

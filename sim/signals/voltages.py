@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 # --- Sample times, computed from the count of samples and never summed.
 

@@ -1,9 +1,9 @@
 """Simulated stages: configuration, presets, stage files, stepping, and control of a stage."""
 
-from sim.stage.config import ParameterChange, StageConfig
-from sim.stage.file import load_stage, save_stage
-from sim.stage.presets import PRESETS, preset
-from sim.stage.stage import Stage, StageState, Trace
+from dehyst.sim.stage.config import ParameterChange, StageConfig
+from dehyst.sim.stage.file import load_stage, save_stage
+from dehyst.sim.stage.presets import PRESETS, preset
+from dehyst.sim.stage.stage import Stage, StageState, Trace
 
 __all__ = [
     "PRESETS",

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import FloatArray, InverseModel
-from sim.signals.references import Reference
-from sim.stage.stage import Stage, StageState
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.sim.signals.references import Reference
+from dehyst.sim.stage.stage import Stage, StageState
 
 
 @dataclass(frozen=True, slots=True)

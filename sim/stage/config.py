@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from adaptive.errors import InputError
-from sim.effects import Chain
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.effects import Chain
 
 #: ``(t_s, {"label.parameter": value})``; ``"axis2/label.parameter"`` is a parameter of the second axis.
 ParameterChange = tuple[float, Mapping[str, float]]

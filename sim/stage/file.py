@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import InputError, ModelFileError
-from sim.effects import Chain, effect
-from sim.stage.config import ParameterChange, StageConfig
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.sim.effects import Chain, effect
+from dehyst.sim.stage.config import ParameterChange, StageConfig
 
 SCHEMA = 1
 _KEYS = ("schema", "name", "dt_s", "seed", "u_min_V", "u_max_V", "effects", "second_axis", "changes")

@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from adaptive.errors import InputError
-from sim.effects import Chain, effect
-from sim.stage.config import StageConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.effects import Chain, effect
+from dehyst.sim.stage.config import StageConfig
 
 
 def rich_chain() -> Chain:

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.effects import Chain, Plan, plan
-from sim.effects.simulation import run_chain
-from sim.stage.config import StageConfig, changed
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.effects import Chain, Plan, plan
+from dehyst.sim.effects.simulation import run_chain
+from dehyst.sim.stage.config import StageConfig, changed
 
 
 @dataclass

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
 

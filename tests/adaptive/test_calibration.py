@@ -17,18 +17,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.identification import identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
-from baselines import fit_linear, fit_mpi
-from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import Competition
-from sim.signals.voltages import generalisation_input, multitone, training_input
-from sim.stage.config import ParameterChange
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.identification import identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.smoothing import SmootherConfig, smooth_recording
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from dehyst.baselines import fit_linear, fit_mpi
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.baselines.competition.competition import Competition
+from dehyst.sim.signals.voltages import generalisation_input, multitone, training_input
+from dehyst.sim.stage.config import ParameterChange
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.online_models import PlainLearner, SmoothingLearner
 
 DT_S = 1e-3

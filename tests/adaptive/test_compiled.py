@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from adaptive import compiled
+from dehyst.adaptive import compiled
 
 
 def test_a_loop_is_compiled_where_no_folder_can_keep_its_machine_code(

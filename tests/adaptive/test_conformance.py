@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import Learner
-from adaptive.types import InverseModel, OnlineModel, Sample
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.bouc_wen.online import BoucWenOnline
-from baselines.common import Domain
-from baselines.competition.competition import Competition
-from baselines.linear import LinearInverse, LinearOnline, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import InverseModel, OnlineModel, Sample
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.bouc_wen.online import BoucWenOnline
+from dehyst.baselines.common import Domain
+from dehyst.baselines.competition.competition import Competition
+from dehyst.baselines.linear import LinearInverse, LinearOnline, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 
 DT, N = 1e-3, 1500
-PACKAGES = ("adaptive", "baselines")
+PACKAGES = ("dehyst.adaptive", "dehyst.baselines")
 Recording = tuple[np.ndarray, np.ndarray]
 Maker = Callable[[Recording, LssvmInverse], Any]
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.state import load, save
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.state import load, save
 
 MAP = FeatureMap(
     dt_s=1e-3,

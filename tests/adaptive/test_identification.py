@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive import identification
-from adaptive.errors import InputError
-from adaptive.identification import IdentifyConfig, identify_lssvm, select
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, Sample
-from sim.signals.voltages import training_input
+from dehyst.adaptive import identification
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm, select
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, Sample
+from dehyst.sim.signals.voltages import training_input
 from tests.foreign.plants import random_plant
 
 DT = 1e-3

@@ -9,10 +9,10 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate
-from adaptive.kernels import gram
-from adaptive.types import InverseModel
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate
+from dehyst.adaptive.kernels import gram
+from dehyst.adaptive.types import InverseModel
 
 
 def points(n: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

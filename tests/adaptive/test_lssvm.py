@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive import kernels, lssvm
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import FloatArray
+from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import FloatArray
 
 # --- The direct solver: the dual system itself, the published reference, leave-one-out and variance by definition.
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-import adaptive
+from dehyst import adaptive
 
 
 def test_the_example_runs() -> None:
@@ -27,7 +27,7 @@ def test_every_name_that_is_offered_is_there() -> None:
 
 def test_light_names_load_neither_numba_nor_scipy() -> None:
     code = (
-        "import sys; from adaptive import InputError, Sample; "
+        "import sys; from dehyst.adaptive import InputError, Sample; "
         "assert not {'numba', 'scipy'} & sys.modules.keys(), 'a heavy library was imported'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,8 +8,8 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.smoothing import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.smoothing import (
     FixedLagSmoother,
     SmootherConfig,
     SmootherState,
@@ -17,7 +17,7 @@ from adaptive.smoothing import (
     smooth_recording,
     zero_phase_lowpass,
 )
-from adaptive.state import load, save
+from dehyst.adaptive.state import load, save
 
 DT = 1e-3
 

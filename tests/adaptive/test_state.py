@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.state import MOST_FLOAT, MOST_INT, Entry, Kinded, load, restore, rows, save
-from adaptive.types import BoolArray, FloatArray, IntArray, StateDict
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.state import MOST_FLOAT, MOST_INT, Entry, Kinded, load, restore, rows, save
+from dehyst.adaptive.types import BoolArray, FloatArray, IntArray, StateDict
 
 SIZES = {"p": 3}
 

@@ -12,18 +12,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.state import load, save
-from adaptive.types import FloatArray
-from baselines import fit_bouc_wen, fit_linear, fit_mpi
-from baselines.bouc_wen.identify import identify_bouc_wen
-from baselines.bouc_wen.model import TABLE_2_1
-from baselines.bounded_least_squares import bounded_least_squares, bounded_minimum
-from baselines.linear import identify_linear
-from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
-from baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
-from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from baselines.swarm.identification import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines import fit_bouc_wen, fit_linear, fit_mpi
+from dehyst.baselines.bouc_wen.identify import identify_bouc_wen
+from dehyst.baselines.bouc_wen.model import TABLE_2_1
+from dehyst.baselines.bounded_least_squares import bounded_least_squares, bounded_minimum
+from dehyst.baselines.linear import identify_linear
+from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
+from dehyst.baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
+from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
+from dehyst.baselines.swarm.identification import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
 
 # --- Identification: known parameters come back, scale and offset hold, bad recordings are refused by name.
 

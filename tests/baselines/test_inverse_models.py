@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.types import InverseModel
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 
 SEEN = Domain(0.0, 88.0, 2000.0)
 MPI = MpiParameters((0.0, 0.5, 1.5), (8.0, 1.5, 1.0), (0.0, 30.0), (1.0, -0.1), c_um=0.4, y_ref_um=-3.0, lag_s=1e-3)
@@ -136,8 +136,8 @@ def test_nan_points_are_marked_and_forgotten(model: LinearInverse | MpiInverse |
 
 def test_torch_is_not_imported_by_any_module() -> None:
     code = (
-        "import importlib, pkgutil, sys, baselines\n"
-        "for m in pkgutil.iter_modules(baselines.__path__): importlib.import_module('baselines.' + m.name)\n"
+        "import importlib, pkgutil, sys\nfrom dehyst import baselines\n"
+        "for m in pkgutil.iter_modules(baselines.__path__): importlib.import_module('dehyst.baselines.' + m.name)\n"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray, Sample
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearOnline, LinearParameters
-from baselines.online_baseline import LeastSquaresConfig
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from baselines.prandtl_ishlinskii.online import MpiOnline
-from baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray, Sample
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearOnline, LinearParameters
+from dehyst.baselines.online_baseline import LeastSquaresConfig
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
 
 DT = 1e-3
 SEEN = Domain(0.0, 80.0, 2000.0)

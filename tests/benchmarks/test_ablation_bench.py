@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.online.glitch_or_jump import level_of
-from adaptive.online.learner import Judgement
 from benchmarks import ablation
 from benchmarks.ablation import (
     ORDER,
@@ -34,6 +32,8 @@ from benchmarks.ablation import (
     worse_cases,
     worse_rows,
 )
+from dehyst.adaptive.online.glitch_or_jump import level_of
+from dehyst.adaptive.online.learner import Judgement
 
 TEXT = '''
 """A module."""
@@ -102,8 +102,8 @@ def in_a_process(call: Callable[[], Any]) -> Any:
 
 def test_a_shift_reaches_compiled_code_and_what_calls_it() -> None:
     swing = np.arange(12.0) % 3.0
-    readers = readers_of("adaptive.online.glitch_or_jump", "NO_LEVEL")
-    assert readers.compiled == (("adaptive.online.glitch_or_jump", "_fit"),)
+    readers = readers_of("dehyst.adaptive.online.glitch_or_jump", "NO_LEVEL")
+    assert readers.compiled == (("dehyst.adaptive.online.glitch_or_jump", "_fit"),)
     # Tests that were imported before read it too.
     product = [place for place in readers.places if "tests" not in Path(place[0]).parts]
     assert text_of(product) == {"_fit(np.ascontiguousarray(", "if remainder < NO_LEVEL:"}
@@ -247,5 +247,5 @@ def test_what_raises_has_failed(cases: list[ablation.Case]) -> None:
 
 
 def test_lines_are_found_by_what_they_read() -> None:
-    lines = text_of(readers_of("adaptive.online.sensor_trust", "STEP_STILL").places)
+    lines = text_of(readers_of("dehyst.adaptive.online.sensor_trust", "STEP_STILL").places)
     assert lines == {"self.still = self.still + 1 if", "self.driven = FORGET * self.driven +"}

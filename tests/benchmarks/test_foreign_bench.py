@@ -23,7 +23,7 @@ from benchmarks.foreign import (
     table,
     told,
 )
-from lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
+from dehyst.lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
 from tests.foreign.plants import random_plant
 
 

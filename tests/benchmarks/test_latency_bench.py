@@ -16,9 +16,9 @@ import pytest
 from benchmarks.exactness import differing, offline_state, taught
 from benchmarks.latency import TRAJECTORY, latency, page
 from benchmarks.sample_feed import AXIS, STAGE, sent
-from service.config.settings import AxisConfig
-from service.protocol.model import fingerprint
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, make_models
 
 PERCENTILES = {"p50", "p99", "p999"}

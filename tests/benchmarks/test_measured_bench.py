@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines import fit_linear
 from benchmarks import measured
 from benchmarks.measured import (
     SCORES,
@@ -26,8 +25,9 @@ from benchmarks.measured import (
     rmse_pct,
     worst_ratio,
 )
-from service.config.settings import COMPETE
-from service.identification.identifying import Stretch
+from dehyst.baselines import fit_linear
+from dehyst.service.config.settings import COMPETE
+from dehyst.service.identification.identifying import Stretch
 
 
 def test_the_recursion_is_weighted_least_squares_of_the_samples_before_the_age() -> None:

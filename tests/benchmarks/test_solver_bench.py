@@ -10,7 +10,7 @@ import pytest
 from benchmarks import run
 from benchmarks.drift import bench_drift
 from benchmarks.solver import bench_window
-from lab.cli import main
+from dehyst.lab.cli import main
 
 #: What `dehyst bench --json` is read for.
 WINDOW_KEYS = {

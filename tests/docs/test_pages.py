@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from lab.cli import main
-from service.client.client import Client
-from service.config.settings import read_config
-from service.stage_node.example_files import write_examples
+from dehyst.lab.cli import main
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import read_config
+from dehyst.service.stage_node.example_files import write_examples
 
 ROOT = Path(__file__).resolve().parents[2]
 _SAVED = re.compile(r"Save as `([\w.]+)`.*?\n```(?:python|toml)\n(.*?)```", re.S)

@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.client.client import Client
-from service.operating.remote import operate, statuses
-from service.protocol.errors import ServiceError
-from service.protocol.keys import Keys
-from service.runtime.session import open_client
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.client.client import Client
+from dehyst.service.operating.remote import operate, statuses
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client
 
 STAGES = ("left", "right")
 AXES = ("x", "y")

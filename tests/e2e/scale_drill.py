@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.security.access import Plan, create
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.service.security.access import Plan, create
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.e2e.scale_client import AXES, BEFORE_S, RATE_HZ, STAGES
 from tests.e2e.scale_hosts import Host, make_hub
 from tests.service.conftest import make_models, unused_port
@@ -60,7 +60,7 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
             host.up()
         router = f"tls/{relay.address}:{unused_port()}"
         create(folder, Plan(USERS, (relay.address,), {"left": "left", "right": "right"}))
-        cli = ("-m", "lab.cli")
+        cli = ("-m", "dehyst.lab.cli")
         route = relay.start(*cli, "router", "--listen", router, "--zenoh-config", str(folder / "relay.json5"), "--json")
         _line(route)
         # Each host serves one stage and stands by for the other: nothing is served by the router's host.

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from lab.cli import main
+from dehyst.lab.cli import main
 
 MODELS = {"linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive"}
 DURATION_S = 12.0
@@ -23,7 +23,7 @@ DURATION_S = 12.0
 
 def demo(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "lab.cli", "demo", "--out", str(out), "--duration", str(DURATION_S), *options],
+        [sys.executable, "-m", "dehyst.lab.cli", "demo", "--out", str(out), "--duration", str(DURATION_S), *options],
         capture_output=True,
         text=True,
         check=False,
@@ -180,7 +180,7 @@ def test_ctrl_c_ends_the_demo_and_all_its_processes(tmp_path: Path) -> None:
     import psutil
 
     process = subprocess.Popen(
-        [sys.executable, "-m", "lab.cli", "demo", "--out", str(tmp_path / "out")],
+        [sys.executable, "-m", "dehyst.lab.cli", "demo", "--out", str(tmp_path / "out")],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.client.client import Client
-from service.identification.identifying import identify_one
-from service.protocol import samples as wire
-from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN, Trajectory
-from service.runtime.session import SURELY, open_client, wait_followed
-from service.stage_node.faults import fault_key
-from service.stage_node.node import status_key
-from service.storage.model_file import BundleMeta, write_bundle
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.service.client.client import Client
+from dehyst.service.identification.identifying import identify_one
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN, Trajectory
+from dehyst.service.runtime.session import SURELY, open_client, wait_followed
+from dehyst.service.stage_node.faults import fault_key
+from dehyst.service.stage_node.node import status_key
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.service.conftest import unused_port
 from tests.service.living import Process
 
@@ -46,7 +46,7 @@ WANTED_UM = 40.0 + 2.0 * np.sin(2 * np.pi * 5.0 * DT_S * np.arange(20))
 ILL = """
 import os, time
 from dataclasses import replace
-from adaptive.online.learner import Learner
+from dehyst.adaptive.online.learner import Learner
 _snapshot = Learner.snapshot
 def snapshot(self):
     while os.path.exists({hung!r}):

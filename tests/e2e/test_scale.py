@@ -14,10 +14,10 @@ from typing import Any
 import psutil
 import pytest
 
-from service.client.client import Client
-from service.protocol.errors import ServiceError
-from service.protocol.keys import AUTO
-from service.protocol.query import Point
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import AUTO
+from dehyst.service.protocol.query import Point
 from tests.e2e.scale_client import LEARNT
 from tests.e2e.scale_hosts import ENTER, namespaces_missing
 from tests.service.conftest import unused_port, write_config

@@ -11,9 +11,9 @@ import time
 import pytest
 import zenoh
 
-from lab.soak.controller import AXIS, STAGE
-from service.protocol.keys import Keys
-from service.runtime.session import LEASE_S, open_client
+from dehyst.lab.soak.controller import AXIS, STAGE
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import LEASE_S, open_client
 from tests.service.conftest import unused_port
 
 RATE_HZ, BYTES = 500.0, 2000
@@ -31,7 +31,7 @@ def started(*module: str) -> subprocess.Popen[str]:
 @pytest.mark.alone
 def test_a_slow_subscriber_holds_nobody_up() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
-    children = [started("lab.cli", "router", "--listen", endpoint)]
+    children = [started("dehyst.lab.cli", "router", "--listen", endpoint)]
     stop = threading.Event()
     came: list[float] = []
 
@@ -51,7 +51,7 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             sender = threading.Thread(target=send, args=(other,))
             sender.start()
             try:
-                children.append(started("lab.soak.disturbers", "slow", endpoint, Keys(STAGE, AXIS).base))
+                children.append(started("dehyst.lab.soak.disturbers", "slow", endpoint, Keys(STAGE, AXIS).base))
                 time.sleep(6.0)
                 # Others come and go meanwhile, which is when everybody would have to wait.
                 for _ in range(4):

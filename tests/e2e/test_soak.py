@@ -21,7 +21,7 @@ SAFE = {"voltages_finite", "voltages_within_limits", "voltages_within_slew", "an
 _WATCHED = """
 import sys
 from numba.core import event
-from lab.cli import main
+from dehyst.lab.cli import main
 
 class Compiled(event.Listener):
     def on_start(self, event):
@@ -39,7 +39,7 @@ def arguments(out: Path, *options: str) -> list[str]:
 
 
 def command(out: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "lab.cli", *arguments(out, *options)]
+    return [sys.executable, "-m", "dehyst.lab.cli", *arguments(out, *options)]
 
 
 def lies_and_nothing_compiled(out: Path, *options: str) -> None:
@@ -166,7 +166,7 @@ def test_ctrl_c_leaves_a_report_of_what_ran(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_asked_for_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from lab.cli import main
+    from dehyst.lab.cli import main
 
     for options, named in (
         (["--duration", "1s"], "--duration: got '1s'"),

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from service.client import Client
+from dehyst.service.client import Client
 from tests.docs.test_pages import ROOT, saved
 from tests.service.conftest import unused_port
 
@@ -59,10 +59,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str
             text = text.replace(printed, here)
         (folder / name).write_text(text)
     with ExitStack() as stack:
-        stack.enter_context(running(folder, "-m", "service.adapters.simulated_pi", "--port", str(pi)))
+        stack.enter_context(running(folder, "-m", "dehyst.service.adapters.simulated_pi", "--port", str(pi)))
         assert "came late" in done(folder, "record_stage.py")
-        assert "models: stage.npz" in done(folder, "-m", "lab.cli", "identify", "recording.csv", "--out", "stage.npz")
-        stack.enter_context(running(folder, "-m", "lab.cli", "serve", "--config", "serve.toml"))
+        assert "models: stage.npz" in done(
+            folder, "-m", "dehyst.lab.cli", "identify", "recording.csv", "--out", "stage.npz"
+        )
+        stack.enter_context(running(folder, "-m", "dehyst.lab.cli", "serve", "--config", "serve.toml"))
         yield folder, f"tcp/127.0.0.1:{service}"
 
 

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.rehearsal.reference import Motion, Reference, ReferenceRequest, SmoothStep, product
+from dehyst.lab.rehearsal.reference import Motion, Reference, ReferenceRequest, SmoothStep, product
 
 FloatArray = NDArray[np.float64]
 #: A motion within 0 to 1 as a function of the time since it began, s.

@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.rehearsal.plant import Change
+from dehyst.lab.rehearsal.plant import Change
 
 FloatArray = NDArray[np.float64]
 

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, Sample
-from lab.rehearsal import Event, RehearsalConfig, identify, run_event
-from lab.rehearsal.disturbance import draw
-from lab.rehearsal.plant import IdentifiedPlant
-from lab.rehearsal.runs import LoopRecord
-from service.answers.which_model import NOTHING_LEARNT, VOLTAGE_DIFFERS
-from service.config.settings import AxisConfig
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, Sample
+from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
+from dehyst.lab.rehearsal.disturbance import draw
+from dehyst.lab.rehearsal.plant import IdentifiedPlant
+from dehyst.lab.rehearsal.runs import LoopRecord
+from dehyst.service.answers.which_model import NOTHING_LEARNT, VOLTAGE_DIFFERS
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.motions import motion
 from tests.foreign.plants import StageFactory, issue_plant, random_plant
 from tests.service.conftest import make_models

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.rehearsal.reference import Motion, ReferenceRequest
-from lab.rehearsal.runs import times
+from dehyst.lab.rehearsal.reference import Motion, ReferenceRequest
+from dehyst.lab.rehearsal.runs import times
 from tests.foreign.motions import (
     BEGIN_S,
     MOTIONS,

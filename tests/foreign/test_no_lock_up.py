@@ -31,18 +31,18 @@ from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from adaptive.online.sensor_trust import SENSOR_FAULTS
-from adaptive.types import FloatArray
-from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
-from lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, MessageLine
-from lab.rehearsal.plant import excitation_range, go_to_lowest
-from lab.rehearsal.reference import Excursion, Reference, SmoothStep
-from service.client.client import PendingCommands
-from service.config.settings import AxisConfig
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.online.sensor_trust import SENSOR_FAULTS
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
+from dehyst.lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, MessageLine
+from dehyst.lab.rehearsal.plant import excitation_range, go_to_lowest
+from dehyst.lab.rehearsal.reference import Excursion, Reference, SmoothStep
+from dehyst.service.client.client import PendingCommands
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.plants import StageFactory, issue_plant, random_plant, with_traits
 
 DT_S, BLOCK = 1e-3, 5

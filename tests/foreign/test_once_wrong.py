@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.foreign import LARGE_S, NAMED_S, run_one
-from lab.rehearsal import RehearsalConfig, identify, run_healthy
+from dehyst.lab.rehearsal import RehearsalConfig, identify, run_healthy
 from tests.foreign.plants import random_plant
 
 

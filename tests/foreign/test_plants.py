@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.rehearsal.plant import Change, Changeable, Plant
+from dehyst.lab.rehearsal.plant import Change, Changeable, Plant
 from tests.foreign.plants import (
     BOUC_WEN,
     DUHEM,

@@ -46,13 +46,13 @@ from numpy.typing import NDArray
 # ---------------------------------------------------------------------------------------------------------------------
 # Adapter: the only section that names the product. Change the imports and these functions after files have moved;
 # leave everything below the next line as it is.
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.types import InverseModel
-from baselines import fit_linear, fit_mpi
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.protocol.model import decode_model, encode_model
-from service.protocol.query import (
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines import fit_linear, fit_mpi
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.model import decode_model, encode_model
+from dehyst.service.protocol.query import (
     Answer,
     FeedforwardQuery,
     Pending,
@@ -61,7 +61,7 @@ from service.protocol.query import (
     encode_query,
     encode_reply,
 )
-from service.protocol.samples import (
+from dehyst.service.protocol.samples import (
     SampleBatch,
     decode_samples,
     encode_command,
@@ -69,16 +69,16 @@ from service.protocol.samples import (
     encode_samples,
     joined,
 )
-from service.replay import covered, replay
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.stage_node.faults import CHANGE, Fault, Injector
-from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, restore_newest
-from service.storage.model_file import Bundle, BundleMeta
-from sim.recordings import ColumnMap, Recording, read, repaired
-from sim.signals.voltages import multitone, training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.service.replay import covered, replay
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.stage_node.faults import CHANGE, Fault, Injector
+from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointMeta, restore_newest
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.sim.recordings import ColumnMap, Recording, read, repaired
+from dehyst.sim.signals.voltages import multitone, training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 LEARNER: Final = "lssvm_adaptive"
 CHAMPION: Final = "auto"

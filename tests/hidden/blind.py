@@ -94,8 +94,8 @@ def judge(kind: str, truth: Truth, verdict: str, named: Named) -> Judgement:
 
 def run_case(kind: str, seed: int) -> Outcome:
     """Make the recording, diagnose it as `dehyst diagnose` does, and judge the answer."""
-    from sim.diagnosis import diagnose_prepared, prepare
-    from sim.recordings import Recording
+    from dehyst.sim.diagnosis import diagnose_prepared, prepare
+    from dehyst.sim.recordings import Recording
 
     truth = KINDS[kind](seed)
     columns = record(truth, *excitation(np.random.default_rng(seed)))

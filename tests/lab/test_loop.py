@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.loop import Asker, Twins, samples, turns
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.cli import main
-from lab.scenarios import (
+from dehyst.lab.cli import main
+from dehyst.lab.scenarios import (
     ADAPTIVE,
     FACTOR,
     FLOORS,
@@ -24,9 +24,9 @@ from lab.scenarios import (
     table,
     windows,
 )
-from sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
-from sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes
-from sim.stage.presets import preset
+from dehyst.sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
+from dehyst.sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes
+from dehyst.sim.stage.presets import preset
 
 GATES = ("learnt", "glitch")
 
@@ -179,7 +179,7 @@ def test_the_command_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytes
 def test_the_command_writes_numbers_and_says_by_its_status_whether_all_held(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lab import scenarios as scenarios_run
+    from dehyst.lab import scenarios as scenarios_run
 
     settings_seen = []
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.intake.sample_queue import SampleQueue
-from service.server.axis import Axis
-from service.server.axis_loop import AxisLoop, SampleSink
+from dehyst.service.intake.sample_queue import SampleQueue
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loop import AxisLoop, SampleSink
 
 
 def loop_of(axis: Axis, sink: SampleSink | None = None, **more: Any) -> AxisLoop:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import InverseModel
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 
 DT_S = 1e-3
 GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
@@ -84,7 +84,7 @@ class ServeProcess:
     def __init__(self, config: Path, port: int) -> None:
         self.endpoint = f"tcp/127.0.0.1:{port}"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "lab.cli", "serve", "--config", str(config), "--json"],
+            [sys.executable, "-m", "dehyst.lab.cli", "serve", "--config", str(config), "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.query import Point
-from service.runtime.session import open_client
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.query import Point
+from dehyst.service.runtime.session import open_client
 
 DT_S = 1e-3
 
@@ -72,7 +72,7 @@ class Process:
             environment["PYTHONPATH"] = os.pathsep.join([str(path), environment.get("PYTHONPATH", "")])
         start = time.monotonic()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "lab.cli", *args, "--json"],
+            [sys.executable, "-m", "dehyst.lab.cli", *args, "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

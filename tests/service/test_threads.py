@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Threads that are named after the module that their process runs.
-NAMED_BY_VALUE = {"service/background/job.py": "service.background"}
+NAMED_BY_VALUE = {"service/background/job.py": "dehyst.service.background"}
 
 
 def test_every_thread_is_named_and_listed() -> None:

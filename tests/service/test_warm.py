@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.warm import GROUPS, PACKAGES, at_first_use, make_bytecode
+from dehyst.service.warm import GROUPS, PACKAGES, at_first_use, make_bytecode
 
 
 def test_bytecode_is_made_of_every_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,7 +59,7 @@ def test_a_log_shows_how_far_it_is(
     root = installation(tmp_path / "site-packages")
     warm = root.joinpath(*GROUPS[0][0].split(".")).with_suffix(".py")
     warm.write_text("import time\ndef warm():\n    open('sim/loop.nbi', 'w').close()\n    time.sleep(2.0)\n")
-    monkeypatch.setattr("service.warm._SAID_EVERY_S", 0.5)
+    monkeypatch.setattr("dehyst.service.warm._SAID_EVERY_S", 0.5)
     at_first_use(root)
     first, *lines = capsys.readouterr().err.splitlines()
     assert first.startswith("compiling the loops, once: 2 minutes on two idle cores")

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.types import FloatArray, InverseModel
-from baselines import fit_mpi
-from sim.changes import Comparison, Scales, Stretch, compare, frozen_answer
-from sim.signals.voltages import training_input
-from sim.stage.config import StageConfig
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.smoothing import SmootherConfig, smooth_recording
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines import fit_mpi
+from dehyst.sim.changes import Comparison, Scales, Stretch, compare, frozen_answer
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
 CHANGE_S = 11.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from sim.mirror import Mirror, MirrorConfig, Wavefront
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.mirror import Mirror, MirrorConfig, Wavefront
 
 SMALL = MirrorConfig(side=6, seed=3)
 

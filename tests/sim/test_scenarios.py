@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, glitch_burst, scenario
-from sim.signals.references import Sequenced, Tones, in_band, strokes
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, glitch_burst, scenario
+from dehyst.sim.signals.references import Sequenced, Tones, in_band, strokes
+from dehyst.sim.stage.stage import Stage
 
 KINDS_SEEDS = [(kind, seed) for kind in SCENARIO_KINDS for seed in (1, 2)]
 

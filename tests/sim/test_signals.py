@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from sim.signals.references import DemoReference, demo_reference
-from sim.signals.voltages import (
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.signals.references import DemoReference, demo_reference
+from dehyst.sim.signals.voltages import (
     generalisation_input,
     growing_triangles,
     minor_loops,

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import zenoh
 
-from adaptive.errors import InputError
 from benchmarks import vectors
-from service.answers.answering import Served, answer
-from service.answers.guard import Limits
-from service.client import follower as follower_module
-from service.client.follower import Follower
-from service.config.settings import AxisConfig
-from service.fleet.wire import decode_fleet
-from service.protocol.delta import FollowedState, decode_delta
-from service.protocol.model import ModelMessage, decode_model
-from service.protocol.query import Trajectory, decode_query, decode_reply
-from service.protocol.samples import decode_command, decode_reference, decode_samples
-from service.security.authenticator import Authenticator, HeardSamples
+from dehyst.adaptive.errors import InputError
+from dehyst.service.answers.answering import Served, answer
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client import follower as follower_module
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.fleet.wire import decode_fleet
+from dehyst.service.protocol.delta import FollowedState, decode_delta
+from dehyst.service.protocol.model import ModelMessage, decode_model
+from dehyst.service.protocol.query import Trajectory, decode_query, decode_reply
+from dehyst.service.protocol.samples import decode_command, decode_reference, decode_samples
+from dehyst.service.security.authenticator import Authenticator, HeardSamples
 from tests.service.protocol import page_client
 
 FOLDER = vectors.DEFAULT_OUT

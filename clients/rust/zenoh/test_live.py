@@ -19,11 +19,11 @@ import pytest
 import zenoh
 
 import tests.conftest  # noqa: F401  the key that service and clients share
-from service.client.client import Client
-from service.protocol.delta import FollowedState, encode_delta
-from service.protocol.model import model_parts
-from service.protocol.query import Answer as Reply
-from service.protocol.query import decode_reply, encode_query, encode_reply
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.delta import FollowedState, encode_delta
+from dehyst.service.protocol.model import model_parts
+from dehyst.service.protocol.query import Answer as Reply
+from dehyst.service.protocol.query import decode_reply, encode_query, encode_reply
 from tests.service.conftest import ServeProcess, make_models, unused_port, write_config
 
 LIBRARY = os.environ.get("DEHYST_ZENOH_LIBRARY", "")

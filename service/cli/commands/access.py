@@ -6,9 +6,9 @@ import argparse
 import json
 from pathlib import Path
 
-from service.cli.options import add_epilog, add_shared
-from service.protocol.errors import FieldError
-from service.security.access import (
+from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.security.access import (
     CLIENT,
     CONTROLLER,
     DEFAULT_HOSTS,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from service.cli.main import build_parser
-from service.cli.options import add_epilog
+from dehyst.service.cli.main import build_parser
+from dehyst.service.cli.options import add_epilog
 
 EPILOG = """\
 Make the folders first where they are missing:

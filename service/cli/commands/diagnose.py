@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.identification.recording_options import add_mapping_arguments, describe, load
-from service.protocol.errors import FieldError
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
 Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), DIR/stage.toml, the extended
@@ -59,11 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, diagnose, write. Returns 0."""
-    from service.reports.diagnosis import Source, write_report
-    from service.storage.output import check_folder
-    from sim.diagnosis.diagnose import diagnose_prepared
-    from sim.diagnosis.prepare import prepare
-    from sim.stage.file import load_stage
+    from dehyst.service.reports.diagnosis import Source, write_report
+    from dehyst.service.storage.output import check_folder
+    from dehyst.sim.diagnosis.diagnose import diagnose_prepared
+    from dehyst.sim.diagnosis.prepare import prepare
+    from dehyst.sim.stage.file import load_stage
 
     say = progress_printer(args.quiet)
     if args.test_range is not None and args.test is None:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.identification.recording_options import add_mapping_arguments, describe, load
-from service.protocol.errors import FieldError
-from service.protocol.keys import check_name
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import check_name
 
 #: A finding after which a model ends where the sensor did.
 CLIPPED = ("clipped", "warning")
@@ -69,10 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
-    from service.identification.identifying import NAMES, Stretch, identify_all, split_at, thinning
-    from service.storage.model_file import BundleMeta, write_bundle
-    from service.storage.output import check_file
-    from sim.recordings import check, repaired, require_usable
+    from dehyst.service.identification.identifying import NAMES, Stretch, identify_all, split_at, thinning
+    from dehyst.service.storage.model_file import BundleMeta, write_bundle
+    from dehyst.service.storage.output import check_file
+    from dehyst.sim.recordings import check, repaired, require_usable
 
     check_name("--stage", args.stage)
     check_name("--axis", args.axis)
@@ -159,7 +159,7 @@ def run(args: argparse.Namespace) -> int:
     )
     write_bundle(args.out, models, meta)
     if picture is not None:
-        from service.identification.identifying import draw_identification
+        from dehyst.service.identification.identifying import draw_identification
 
         title = f"{args.data.name}: inverse models, judged on {judged_on}"
         draw_identification(picture, title, train, test, dt_s * every, results, gain)

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.errors import InputError
-from service.cli.options import add_epilog, add_shared
-from service.identification.recording_options import add_mapping_arguments, mapping_from, to_fill_in
-from sim.recordings import Finding, Recording, check
-from sim.recordings.columns import MissingError
-from sim.recordings.reader import read, read_table
-from sim.recordings.table import Table
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from, to_fill_in
+from dehyst.sim.recordings import Finding, Recording, check
+from dehyst.sim.recordings.columns import MissingError
+from dehyst.sim.recordings.reader import read, read_table
+from dehyst.sim.recordings.table import Table
 
 EPILOG = """\
 Of two columns in V it asks which is which (exit status 1); the second example answers.
@@ -159,8 +159,8 @@ def text(found: dict[str, Any], findings: list[Finding]) -> str:
 
 def draw(path: Path, title: str, recording: Recording) -> None:
     """Voltage and displacement over time, and the loop. Raises OSError."""
-    from service.reports.plot_style import envelope, figure, label, line, save
-    from service.viewer.colours import MEASURED, TRAINING
+    from dehyst.service.reports.plot_style import envelope, figure, label, line, save
+    from dehyst.service.viewer.colours import MEASURED, TRAINING
 
     y_name = f"{'displacement' if recording.y_unit == 'µm' else 'angle'} y / {recording.y_unit}"
     drawn, axes = figure(2, 2, (12.0, 7.0), title, width_ratios=[1.4, 1.0])

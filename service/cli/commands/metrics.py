@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
-from service.protocol.errors import FieldError
+from dehyst.service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
+from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
 Grafana: import deploy/grafana-dashboard.json. Names and alarms: docs/monitoring.md.
@@ -32,10 +32,10 @@ def run(args: argparse.Namespace) -> int:
     check_selection(args)
     if not 0 <= args.port <= 65535:
         raise FieldError("--port", args.port, "0 to 65535")
-    from service.operating.metrics import page, serve_page
-    from service.operating.remote import statuses
-    from service.runtime.session import open_client
-    from service.runtime.stopping import StopSignal
+    from dehyst.service.operating.metrics import page, serve_page
+    from dehyst.service.operating.remote import statuses
+    from dehyst.service.runtime.session import open_client
+    from dehyst.service.runtime.stopping import StopSignal
 
     stop = StopSignal()
     with open_client(args.endpoint, args.wait, args.zenoh_config) as session:

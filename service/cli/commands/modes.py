@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.identification.recording_options import add_mapping_arguments, mapping_from
-from service.protocol.errors import FieldError
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from
+from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
 For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
@@ -55,10 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, fit, judge, write. Returns 0."""
-    from service.reports.modes import write_modes
-    from service.storage.output import check_folder
-    from sim.modal import FitSettings, study
-    from sim.modal.reading import read_periodic
+    from dehyst.service.reports.modes import write_modes
+    from dehyst.service.storage.output import check_folder
+    from dehyst.sim.modal import FitSettings, study
+    from dehyst.sim.modal.reading import read_periodic
 
     if args.start_modes < 1:
         raise FieldError("--start-modes", args.start_modes, "1 or more")

@@ -8,10 +8,10 @@ import json
 import time
 from typing import Any, Final
 
-from service.cli.options import add_connection, add_epilog, add_shared
-from service.operating.remote import operate
-from service.protocol.keys import Keys
-from service.runtime.session import open_client
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client
 
 EPILOG = """\
 The service records who commanded what, when, and from which sample on it took effect. Where other machines can reach

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from service.cli.options import add_connection, add_epilog, add_shared
-from service.protocol.errors import FieldError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from service.protocol.query import Trajectory
+    from dehyst.service.protocol.query import Trajectory
 
 EPILOG = """\
   dehyst query 40                              # the voltage for 40 µm at rest
@@ -49,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask and print. Returns 0. Raises ServiceError where there is no answer or the service refuses."""
-    from service.client.client import Client
-    from service.protocol.query import NEWEST, flag_names
+    from dehyst.service.client.client import Client
+    from dehyst.service.protocol.query import NEWEST, flag_names
 
     columns = _columns(args)
     with Client.connect(

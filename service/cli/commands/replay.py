@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.options import add_epilog, add_shared, progress_printer
-from service.identification.recording_options import add_mapping_arguments, describe, load
-from service.protocol.errors import FieldError
+from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from service.config.learner import LearnerSettings
+    from dehyst.service.config.learner import LearnerSettings
 
 EPILOG = """\
 For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
@@ -57,14 +57,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
-    from adaptive.inverse_model import LssvmInverse
-    from service.background.retuner import read_adoptions
-    from service.config.learner import read_learner_settings
-    from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
-    from service.server.axis_loading import load_axis
-    from service.server.learner_supervisor import standing_of
-    from service.storage.model_file import read_bundle, write_bundle
-    from service.storage.output import clear_output
+    from dehyst.adaptive.inverse_model import LssvmInverse
+    from dehyst.service.background.retuner import read_adoptions
+    from dehyst.service.config.learner import read_learner_settings
+    from dehyst.service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
+    from dehyst.service.server.axis_loading import load_axis
+    from dehyst.service.server.learner_supervisor import standing_of
+    from dehyst.service.storage.model_file import read_bundle, write_bundle
+    from dehyst.service.storage.output import clear_output
 
     say = progress_printer(args.quiet)
     if not args.window > 0.0:
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     write_gates(args.out / "gates.csv", done)
     write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
     if not args.no_pictures:
-        from service.replay import draw_errors, draw_gates
+        from dehyst.service.replay import draw_errors, draw_gates
 
         draw_errors(args.out / "errors.png", f"{args.data.name}: predicted, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)

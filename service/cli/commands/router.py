@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_epilog, add_shared
 
 EPILOG = """\
   dehyst router --listen tcp/127.0.0.1:7450
@@ -26,10 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Route until interrupted. Returns 0. Raises DehystError where an endpoint is in use or not allowed."""
-    from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_router
-    from service.runtime.stopping import StopSignal
-    from service.security.access import check_reach, has_access_control
-    from service.security.refusals import count_refusals, refusal_counters
+    from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_router
+    from dehyst.service.runtime.stopping import StopSignal
+    from dehyst.service.security.access import check_reach, has_access_control
+    from dehyst.service.security.refusals import count_refusals, refusal_counters
 
     listen = [check_endpoint("--listen", endpoint) for endpoint in args.listen or [DEFAULT_ENDPOINT]]
     connect = [check_endpoint("--connect", endpoint) for endpoint in args.connect]

@@ -11,18 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from service.cli.options import add_epilog, add_shared
-from service.config.settings import ServeConfig, read_config
-from service.protocol.errors import FieldError
-from service.runtime.descriptors import need_descriptors
-from service.runtime.memory import starting
-from service.runtime.session import check_endpoint, is_loopback
-from service.security.access import has_access_control
-from service.security.refusals import count_refusals
+from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.config.settings import ServeConfig, read_config
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.descriptors import need_descriptors
+from dehyst.service.runtime.memory import starting
+from dehyst.service.runtime.session import check_endpoint, is_loopback
+from dehyst.service.security.access import has_access_control
+from dehyst.service.security.refusals import count_refusals
 
 if TYPE_CHECKING:
-    from service.runtime.stopping import StopSignal
-    from service.server.process import Service
+    from dehyst.service.runtime.stopping import StopSignal
+    from dehyst.service.server.process import Service
 
 EPILOG = """\
 All keys of the configuration: docs/configuration.md.
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted. Returns 0. Raises DehystError where configuration, model file or port is wrong."""
     if args.example:
-        from service.config.reference import example
+        from dehyst.service.config.reference import example
 
         print(example(), end="")
         return 0
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
         need_descriptors(len(config.axes) or 1)
         if config.fleet is not None:
             return _run_fleet(config, args, started)
-        from service.runtime.stopping import StopSignal
-        from service.server.process import Service, tune_process
+        from dehyst.service.runtime.stopping import StopSignal
+        from dehyst.service.server.process import Service, tune_process
 
         tune_process()
         stop = StopSignal()
@@ -95,9 +95,9 @@ def _run_fleet(config: ServeConfig, args: argparse.Namespace, started: Callable[
     """Serve a fleet until interrupted. Only here a fleet is imported."""
     if args.standby:
         raise FieldError("--standby", "a fleet", "[[axis]] tables", "a fleet has no standby")
-    from service.fleet.serving import FleetService
-    from service.runtime.stopping import StopSignal
-    from service.server.process import tune_process
+    from dehyst.service.fleet.serving import FleetService
+    from dehyst.service.runtime.stopping import StopSignal
+    from dehyst.service.server.process import tune_process
 
     tune_process()
     stop = StopSignal()

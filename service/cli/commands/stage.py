@@ -9,11 +9,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from service.cli.options import add_epilog, add_shared
-from service.protocol.errors import FieldError
-from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
-from service.runtime.stopping import StopSignal
-from sim.stage.config import ParameterChange, StageConfig
+from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.sim.stage.config import ParameterChange, StageConfig
 
 EPILOG = """\
 The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
@@ -86,11 +86,11 @@ def parse_change(text: str) -> ParameterChange:
 def stage_config(args: argparse.Namespace) -> StageConfig:
     """The stage that the options describe. Raises InputError."""
     if args.file is not None:
-        from sim.stage.file import load_stage
+        from dehyst.sim.stage.file import load_stage
 
         config = load_stage(args.file)
     else:
-        from sim.stage.presets import preset
+        from dehyst.sim.stage.presets import preset
 
         config = preset(args.preset)
     if args.rate is not None:
@@ -108,9 +108,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the stage until its end, Ctrl-C or SIGTERM. Returns 0."""
     if args.examples is not None:
         return write_example_files(args.examples)
-    from service.runtime.session import open_client, open_service
-    from service.security.access import check_reach
-    from service.stage_node.node import NodeConfig, StageNode
+    from dehyst.service.runtime.session import open_client, open_service
+    from dehyst.service.security.access import check_reach
+    from dehyst.service.stage_node.node import NodeConfig, StageNode
 
     stop = StopSignal(raising=True)
     config = stage_config(args)
@@ -159,7 +159,7 @@ def run(args: argparse.Namespace) -> int:
 
 def write_example_files(folder: Path) -> int:
     """Write them and print what is what. Returns 0. Raises InputError where the folder cannot be written to."""
-    from service.stage_node.example_files import write_examples
+    from dehyst.service.stage_node.example_files import write_examples
 
     try:
         for name, text in write_examples(folder):

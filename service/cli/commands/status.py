@@ -11,13 +11,13 @@ from typing import Any
 
 import zenoh
 
-from service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
-from service.operating.remote import Standbys, in_order, screen, statuses, table, warnings
-from service.protocol.container import fields_of
-from service.protocol.errors import FieldError, SessionError
-from service.protocol.keys import ROOT
-from service.runtime.session import open_client
-from service.runtime.stopping import StopSignal
+from dehyst.service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
+from dehyst.service.operating.remote import Standbys, in_order, screen, statuses, table, warnings
+from dehyst.service.protocol.container import fields_of
+from dehyst.service.protocol.errors import FieldError, SessionError
+from dehyst.service.protocol.keys import ROOT
+from dehyst.service.runtime.session import open_client
+from dehyst.service.runtime.stopping import StopSignal
 
 #: A little more than the period at which a standby publishes its status, s.
 _STANDBY_PERIOD_S = 1.2

@@ -10,14 +10,14 @@ import time
 import uuid
 from pathlib import Path
 
-from adaptive.errors import InputError
-from service.cli.options import add_connection, add_epilog, add_shared
-from service.protocol.errors import ServiceError
-from service.runtime.session import open_client
-from service.runtime.stopping import StopSignal
-from service.viewer.consumer import Consumer, ConsumerConfig
-from service.viewer.output import Output, OutputConfig
-from service.viewer.records import SceneConfig
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.runtime.session import open_client
+from dehyst.service.runtime.stopping import StopSignal
+from dehyst.service.viewer.consumer import Consumer, ConsumerConfig
+from dehyst.service.viewer.output import Output, OutputConfig
+from dehyst.service.viewer.records import SceneConfig
 
 log = logging.getLogger("dehyst.view")
 
@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
             url = args.connect
             if args.spawn or args.web:
-                from service.viewer.rerun_sink import page_of, spawn_viewer
+                from dehyst.service.viewer.rerun_sink import page_of, spawn_viewer
 
                 viewer, url = spawn_viewer(args.port, web_port=args.web_port if args.web else None)
                 if args.web:

@@ -1,6 +1,6 @@
 """The search for causes, and the held-out error by which it decides."""
 
-from sim.diagnosis.search.held_out import HeldOut, held_out
-from sim.diagnosis.search.search import Search, Thresholds, review
+from dehyst.sim.diagnosis.search.held_out import HeldOut, held_out
+from dehyst.sim.diagnosis.search.search import Search, Thresholds, review
 
 __all__ = ["HeldOut", "Search", "Thresholds", "held_out", "review"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.types import BoolArray, FloatArray
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import INITIAL_STATE, ModelFit
-from sim.readings.noise import monitor_noise_V
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import INITIAL_STATE, ModelFit
+from dehyst.sim.readings.noise import monitor_noise_V
 
 IntArray = NDArray[np.int64]
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from adaptive.types import BoolArray, FloatArray
-from baselines.prandtl_ishlinskii.operators import play_run
-from sim.diagnosis.search.held_out import Split
-from sim.fitting.calibration import clipped_to_bounds
-from sim.fitting.stage_model import ModelFit
-from sim.readings.readings import Readings
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.baselines.prandtl_ishlinskii.operators import play_run
+from dehyst.sim.diagnosis.search.held_out import Split
+from dehyst.sim.fitting.calibration import clipped_to_bounds
+from dehyst.sim.fitting.stage_model import ModelFit
+from dehyst.sim.readings.readings import Readings
 
 #: Thresholds of the plays of a freer loop, in swings of the voltage.
 _RADII = np.geomspace(0.004, 0.7, 14)

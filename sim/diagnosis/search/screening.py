@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.search.held_out import Split, unit_columns
-from sim.fitting.fit_data import ActsOn
-from sim.fitting.stage_model import ModelFit, StageModel
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.diagnosis.search.held_out import Split, unit_columns
+from dehyst.sim.fitting.fit_data import ActsOn
+from dehyst.sim.fitting.stage_model import ModelFit, StageModel
 
 
 @dataclass(frozen=True)

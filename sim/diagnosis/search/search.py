@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.catalogue import CATALOGUE, Catalogue
-from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
-from sim.diagnosis.search.intervals import across_zero, parameter_errors
-from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
-from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
-from sim.fitting.calibration import (
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from dehyst.sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
+from dehyst.sim.diagnosis.search.intervals import across_zero, parameter_errors
+from dehyst.sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
+from dehyst.sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
+from dehyst.sim.fitting.calibration import (
     calibrate,
     clipped_to_bounds,
     evaluate,
@@ -27,11 +27,11 @@ from sim.fitting.calibration import (
     with_free_memory,
     with_new_columns,
 )
-from sim.fitting.parallel import side_by_side
-from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
-from sim.readings.noise import has_spectral_line
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
+from dehyst.sim.fitting.parallel import side_by_side
+from dehyst.sim.fitting.stage_model import CauseModel, ModelFit, StageModel
+from dehyst.sim.readings.noise import has_spectral_line
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
 
 #: Least squared error that a line must remove, in that of the noise: half the square of a twentieth of its deviation.
 _LINE = 0.5 * 0.05**2

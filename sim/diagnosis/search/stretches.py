@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim.diagnosis.search.held_out import Split
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.search.held_out import Split
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from adaptive.correction.integral import GAIN_MARGIN, PHASE_MARGIN, Correction, design, sensitivity
-from adaptive.errors import InputError
-from adaptive.types import Feedforward, FloatArray
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
+from dehyst.adaptive.correction.integral import GAIN_MARGIN, PHASE_MARGIN, Correction, design, sensitivity
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import Feedforward, FloatArray
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
 
 DT_S = st.sampled_from([1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 LAG_S = st.floats(0.0, 3e-3)
@@ -209,7 +209,7 @@ def test_no_unstable_gain_is_kept_for_ten_periods(
     begin = int(np.argmax(kept_um > 0.25))
     assert np.diff([begin, *changes]).max() * dt_s * mode_Hz < 10.0
     assert kept_um[-n // 10 :].max() < 0.25
-    monkeypatch.setattr("adaptive.correction.integral._HALF_PERIODS", 10**9)
+    monkeypatch.setattr("dehyst.adaptive.correction.integral._HALF_PERIODS", 10**9)
     assert run()[0][-n // 10 :].max() > 0.6
 
 
@@ -234,7 +234,7 @@ def test_a_ring_that_dies_away_and_the_motion_itself_are_no_oscillation_of_the_l
 
 
 def test_the_gain_comes_back_after_a_quiet_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("adaptive.correction.integral._RECOVER_S", 0.5)
+    monkeypatch.setattr("dehyst.adaptive.correction.integral._RECOVER_S", 0.5)
     correction = made(bound_V=1.0)
     for k in range(400):
         correction.take(0.5 * math.sin(2e-3 * math.pi * 20.0 * k), 1e9)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from adaptive.correction.repetition import (
+from dehyst.adaptive.correction.repetition import (
     GAIN,
     GROWTH,
     KEPT,
@@ -22,8 +22,8 @@ from adaptive.correction.repetition import (
     growth,
     kernel,
 )
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 
 DT_S = st.sampled_from([1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 

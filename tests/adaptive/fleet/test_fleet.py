@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.fleet.fleet import Fleet, FleetConfig
-from adaptive.fleet.state import OUTCOMES
-from adaptive.fleet.step import NO_SAMPLE
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.gates import AdmissionConfig
-from adaptive.online.learner import Learner
-from adaptive.online.sensor_trust import SENSOR_STUCK
-from adaptive.types import Sample
-from adaptive.window.window import SolverConfig
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
+from dehyst.adaptive.fleet.state import OUTCOMES
+from dehyst.adaptive.fleet.step import NO_SAMPLE
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.gates import AdmissionConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.sensor_trust import SENSOR_STUCK
+from dehyst.adaptive.types import Sample
+from dehyst.adaptive.window.window import SolverConfig
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
 ALIKE = 1e-9

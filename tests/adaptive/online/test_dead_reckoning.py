@@ -9,13 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.dead_reckoning import CREEP_PER_S, LOST_SHARE, OFF_LINE, SLOPES, Reckoning, answers, mean_slope
-from adaptive.online.learner import Learner
-from adaptive.state import load, save
-from adaptive.types import FloatArray, Sample
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.dead_reckoning import (
+    CREEP_PER_S,
+    LOST_SHARE,
+    OFF_LINE,
+    SLOPES,
+    Reckoning,
+    answers,
+    mean_slope,
+)
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray, Sample
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
 REST = (40.0, 0.0, 0.0)

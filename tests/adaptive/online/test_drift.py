@@ -11,17 +11,17 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import drift
-from adaptive.online import drift as drift_step
-from adaptive.online.config import LearnerConfig
-from adaptive.online.drift import DriftConfig, DriftFilter, RestCreep
-from adaptive.online.learner import Learner
-from adaptive.state import load, restore, save
-from adaptive.types import Sample
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import drift
+from dehyst.adaptive.online import drift as drift_step
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.drift import DriftConfig, DriftFilter, RestCreep
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, restore, save
+from dehyst.adaptive.types import Sample
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- The drift filter finds a gain, an offset and a lag fast, and does not wind up at rest.
 

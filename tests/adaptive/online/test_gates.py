@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates
-from adaptive.online.config import LearnerConfig
-from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig
-from adaptive.online.learner import Learner
-from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
-from adaptive.state import load, save
-from adaptive.types import FloatArray, Sample, StateDict
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray, Sample, StateDict
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- Each gate refuses what it is for, lets the rest through, and never raises on data.
 

@@ -11,11 +11,11 @@ from typing import NamedTuple, get_type_hints
 import numpy as np
 import pytest
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.dead_reckoning import Reckoning
-from adaptive.online.gates import GLITCH, AdmissionConfig, EnvelopeConfig
-from adaptive.online.glitch_or_jump import (
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.dead_reckoning import Reckoning
+from dehyst.adaptive.online.gates import GLITCH, AdmissionConfig, EnvelopeConfig
+from dehyst.adaptive.online.glitch_or_jump import (
     LEVEL_STD,
     NO_LEVEL,
     SIGMA,
@@ -28,11 +28,11 @@ from adaptive.online.glitch_or_jump import (
     judge,
     level_of,
 )
-from adaptive.online.learner import Learner
-from adaptive.state import load, save
-from adaptive.types import FloatArray, Sample, StateDict
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray, Sample, StateDict
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- Glitch, knock, ringing, jump: what a run of surprising readings is taken for, and how often wrongly.
 #

@@ -8,19 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.drift import DriftFilter
-from adaptive.online.gates import AdmissionConfig
-from adaptive.online.kernel_window import ResidualWindow
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, Sample
-from sim.signals.references import demo_reference
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.drift import DriftFilter
+from dehyst.adaptive.online.gates import AdmissionConfig
+from dehyst.adaptive.online.kernel_window import ResidualWindow
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, Sample
+from dehyst.sim.signals.references import demo_reference
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- The learner in the loop with the simulated stage, at the delays at which it is served.
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from adaptive.inverse_model import LssvmInverse, track_memory
-from adaptive.online.learner import Learner
-from adaptive.online.missing_motion import TURNS, MissingMotion
-from adaptive.types import FloatArray, Sample, StateDict
-from baselines.prandtl_ishlinskii.model import MpiParameters
-from service.identification.identifying import motion_of
-from sim.recordings import Recording
-from sim.signals.voltages import multitone
+from dehyst.adaptive.inverse_model import LssvmInverse, track_memory
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.missing_motion import TURNS, MissingMotion
+from dehyst.adaptive.types import FloatArray, Sample, StateDict
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
+from dehyst.service.identification.identifying import motion_of
+from dehyst.sim.recordings import Recording
+from dehyst.sim.signals.voltages import multitone
 
 DT = 1e-3
 #: A stage that is none of those that the models here are identified from: its hysteresis is one of plays alone.

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import ModelFileError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.dead_reckoning import Reckoning
-from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
-from adaptive.online.glitch_or_jump import Circumstances
-from adaptive.online.learner import ALONE_SHARE, MOVES, Learner
-from adaptive.online.sensor_trust import (
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.dead_reckoning import Reckoning
+from dehyst.adaptive.online.gates import AdmissionConfig, EnvelopeConfig
+from dehyst.adaptive.online.glitch_or_jump import Circumstances
+from dehyst.adaptive.online.learner import ALONE_SHARE, MOVES, Learner
+from dehyst.adaptive.online.sensor_trust import (
     CREEP_PER_S,
     FOLLOWING_SLOPES,
     LOOKS,
@@ -36,11 +36,11 @@ from adaptive.online.sensor_trust import (
     bends_otherwise,
     slope_of,
 )
-from adaptive.state import load, save
-from adaptive.types import FloatArray, Sample, StateDict
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray, Sample, StateDict
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- Does the sensor follow the drive? The steps of the voltage against those that the model asks for at the readings.
 

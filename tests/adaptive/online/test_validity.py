@@ -12,11 +12,11 @@ import math
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement, Learner
-from adaptive.state import load, restore, save
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.learner import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement, Learner
+from dehyst.adaptive.state import load, restore, save
 
 ENTER_V, LEAVE_V = 0.25, 1.0
 BETWEEN_V = 0.5

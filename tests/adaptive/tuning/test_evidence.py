@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from adaptive import kernels, lssvm
-from adaptive.errors import InputError, NumericsError
-from adaptive.tuning import evidence
-from adaptive.tuning import search as inference
-from adaptive.tuning.search import InferenceConfig
+from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.tuning import evidence
+from dehyst.adaptive.tuning import search as inference
+from dehyst.adaptive.tuning.search import InferenceConfig
 
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "lssvm-reference"
 needs_reference = pytest.mark.skipif(not DATA.is_dir(), reason=f"reference values not found at {DATA}; set DEHYST_DATA")

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.tuning.config import RetuneConfig
-from adaptive.tuning.evidence import evaluate, evidence_samples
-from adaptive.tuning.retuning import Proposal, bounds_of, compare, fresh_rows, pattern, propose, significance
-from adaptive.types import FloatArray, Hyperparameters, Sample, WindowData
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.tuning.config import RetuneConfig
+from dehyst.adaptive.tuning.evidence import evaluate, evidence_samples
+from dehyst.adaptive.tuning.retuning import Proposal, bounds_of, compare, fresh_rows, pattern, propose, significance
+from dehyst.adaptive.types import FloatArray, Hyperparameters, Sample, WindowData
 
 # --- Hyper-parameters from the live window: proposed by the evidence, tried on fresh samples, taken only if better.
 
@@ -298,17 +298,17 @@ def test_window_data_is_a_copy_that_travels(state: dict[str, object]) -> None:
 _ADOPT = """
 import sys
 import numpy as np
-from adaptive.features import FeatureMap
-from adaptive.online.learner import Learner
-from adaptive.types import Hyperparameters
-from adaptive.online.config import LearnerConfig
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import Sample
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import Hyperparameters
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import Sample
 
 def loaded():
     found = set()
     for name, module in list(sys.modules.items()):
-        if name.startswith("adaptive."):
+        if name.startswith("dehyst.adaptive."):
             for value in vars(module).values():
                 if getattr(value, "signatures", None):
                     found.add(f"{value.py_func.__module__}.{value.py_func.__name__}")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor
 
-from adaptive import lssvm
-from adaptive.types import FloatArray
-from adaptive.window import arrays as ws
-from adaptive.window import cholesky_form, steps
-from adaptive.window.arrays import KEPT_STEPS, Status
-from adaptive.window.window import Window, WindowConfig
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import cholesky_form, steps
+from dehyst.adaptive.window.arrays import KEPT_STEPS, Status
+from dehyst.adaptive.window.window import Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, STEPS, filled, sample
 
 

@@ -11,16 +11,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from adaptive import lapack, lssvm
-from adaptive.errors import InputError, NumericsError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online import gates as admission
-from adaptive.online.kernel_window import ResidualWindow
-from adaptive.types import FloatArray
-from adaptive.window import healing as window_refresh
-from adaptive.window.arrays import CHOLESKY_FORM, FORM, TOLERANCE, Status
-from adaptive.window.healing import STEPS, Refresh
-from adaptive.window.window import Form, SolverConfig, Window, WindowConfig
+from dehyst.adaptive import lapack, lssvm
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.online.kernel_window import ResidualWindow
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window import healing as window_refresh
+from dehyst.adaptive.window.arrays import CHOLESKY_FORM, FORM, TOLERANCE, Status
+from dehyst.adaptive.window.healing import STEPS, Refresh
+from dehyst.adaptive.window.window import Form, SolverConfig, Window, WindowConfig
 
 # --- A worn-out window is healed beside its work, at the same sample whatever the thread does.
 

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive import lssvm
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from adaptive.window import arrays as ws
-from adaptive.window import healing as window_refresh
-from adaptive.window import steps
-from adaptive.window.arrays import Status
-from adaptive.window.window import Form, Window, WindowConfig
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import healing as window_refresh
+from dehyst.adaptive.window import steps
+from dehyst.adaptive.window.arrays import Status
+from dehyst.adaptive.window.window import Form, Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, GAMMA, WIDTHS, filled, forms, sample
 
 HELD = 12

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive import lssvm
-from adaptive.errors import InputError, ModelFileError, NumericsError
-from adaptive.state import load, save
-from adaptive.types import FloatArray
-from adaptive.window import arrays as ws
-from adaptive.window import steps
-from adaptive.window.arrays import Status, handle_of
-from adaptive.window.healing import begin
-from adaptive.window.window import Form, SolverState, Window, WindowConfig
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.errors import InputError, ModelFileError, NumericsError
+from dehyst.adaptive.state import load, save
+from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window import steps
+from dehyst.adaptive.window.arrays import Status, handle_of
+from dehyst.adaptive.window.healing import begin
+from dehyst.adaptive.window.window import Form, SolverState, Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
 
 # --- The sliding window in both forms, against the direct solver and against itself.

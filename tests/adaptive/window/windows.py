@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from adaptive import lssvm
-from adaptive.window.arrays import BETA, Status
-from adaptive.window.window import Form, Window, WindowConfig
+from dehyst.adaptive import lssvm
+from dehyst.adaptive.window.arrays import BETA, Status
+from dehyst.adaptive.window.window import Form, Window, WindowConfig
 
 FORMS: list[Form] = ["inverse", "cholesky"]
 forms = pytest.mark.parametrize("form", FORMS)

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
-from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
-from baselines.common import Domain
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
+from dehyst.baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
+from dehyst.baselines.common import Domain
 
 # --- The Bouc-Wen stage and its inverse: closed forms against fine integration, and round trips.
 

@@ -8,19 +8,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.features import FeatureMap
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, InverseModel, Sample
-from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
-from baselines.common import Domain
-from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition, with_deviation_of_at_least
-from baselines.competition.config import CompetitionConfig
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from baselines.prandtl_ishlinskii.online import MpiOnline
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, InverseModel, Sample
+from dehyst.baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
+from dehyst.baselines.common import Domain
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.baselines.competition.competition import (
+    BETTER,
+    FAILED,
+    ChampionChoice,
+    Competition,
+    with_deviation_of_at_least,
+)
+from dehyst.baselines.competition.config import CompetitionConfig
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 from tests.online_models import SmoothingLearner
 
 DT, GAIN, SPAN_V, RANGE_UM = 1e-3, 11.0, 7.0, 77.0

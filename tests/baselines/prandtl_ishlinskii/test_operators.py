@@ -10,11 +10,11 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.state import load, save
-from baselines.common import Domain
-from baselines.prandtl_ishlinskii import operators
-from baselines.prandtl_ishlinskii.model import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.state import load, save
+from dehyst.baselines.common import Domain
+from dehyst.baselines.prandtl_ishlinskii import operators
+from dehyst.baselines.prandtl_ishlinskii.model import (
     MpiInverse,
     MpiParameters,
     from_inverse_saturation,
@@ -23,8 +23,8 @@ from baselines.prandtl_ishlinskii.model import (
     states_from_inverse,
     states_to_inverse,
 )
-from baselines.prandtl_ishlinskii.online import GainFilter
-from baselines.prandtl_ishlinskii.operators import (
+from dehyst.baselines.prandtl_ishlinskii.online import GainFilter
+from dehyst.baselines.prandtl_ishlinskii.operators import (
     dead_zone,
     dead_zone_sum,
     play_run,

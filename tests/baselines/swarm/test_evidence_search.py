@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from adaptive.tuning.evidence import EvidenceSamples, evaluate, evidence_samples
-from baselines.swarm.evidence_search import EvidenceSearch, EvidenceSearchConfig, _Batch
-from baselines.swarm.identification import MissingTorchError
+from dehyst.adaptive.tuning.evidence import EvidenceSamples, evaluate, evidence_samples
+from dehyst.baselines.swarm.evidence_search import EvidenceSearch, EvidenceSearchConfig, _Batch
+from dehyst.baselines.swarm.identification import MissingTorchError
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 

@@ -16,8 +16,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from itertools import combinations
 
-from adaptive.errors import InputError
-from sim.diagnosis import diagnose_prepared, prepare
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.diagnosis import diagnose_prepared, prepare
 from tests.hidden.foreign.score import KINDS, named_in, nominal_of, recording_of
 
 #: Parts of a record, as shares of its length.

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
-from sim.effects import Chain, effect
-from sim.recordings import Recording
-from sim.stage.config import StageConfig
+from dehyst.sim.diagnosis import Diagnosis, diagnose_prepared, prepare
+from dehyst.sim.effects import Chain, effect
+from dehyst.sim.recordings import Recording
+from dehyst.sim.stage.config import StageConfig
 from tests.hidden.cases import same
 from tests.hidden.foreign.cases import healthy, pair, single, triple
 from tests.hidden.foreign.record import Case, record

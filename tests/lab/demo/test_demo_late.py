@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.demo.controller import blocks_now
-from lab.demo.plan import make_plan
-from lab.demo.result import MOST_LATE, clock_missed, pace
+from dehyst.lab.demo.controller import blocks_now
+from dehyst.lab.demo.plan import make_plan
+from dehyst.lab.demo.result import MOST_LATE, clock_missed, pace
 
 
 @pytest.mark.parametrize("late", [0, 1, round(60_000 * MOST_LATE)])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.cli import main
+from dehyst.lab.cli import main
 
 
 @pytest.mark.timeout(170)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from lab.rehearsal import (
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.rehearsal import (
     CLASSES,
     EVENT_KINDS,
     INTACT,
@@ -26,13 +26,13 @@ from lab.rehearsal import (
     factory_of,
     rehearse,
 )
-from lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
-from lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
-from lab.rehearsal.plant import run_checked
-from lab.rehearsal.reference import Excursion
-from lab.rehearsal.rehearsal import remarks, table
-from service.answers.guard import Limits
-from service.protocol.samples import MAX_SEQ
+from dehyst.lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from dehyst.lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
+from dehyst.lab.rehearsal.plant import run_checked
+from dehyst.lab.rehearsal.reference import Excursion
+from dehyst.lab.rehearsal.rehearsal import remarks, table
+from dehyst.service.answers.guard import Limits
+from dehyst.service.protocol.samples import MAX_SEQ
 from tests.foreign.plants import issue_plant, random_plant
 
 WORLD = EventScale(range_um=100.0, middle_um=50.0, rest_um=0.0)

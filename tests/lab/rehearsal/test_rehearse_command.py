@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from lab.cli import main
-from lab.commands.rehearse import failed
-from lab.rehearsal.rehearsal import remarks
-from service.cli.python_file import load_object
+from dehyst.lab.cli import main
+from dehyst.lab.commands.rehearse import failed
+from dehyst.lab.rehearsal.rehearsal import remarks
+from dehyst.service.cli.python_file import load_object
 
 ROOT = Path(__file__).resolve().parents[3]
 #: Rate-dependent in nothing, and fast: two plays in a line, a sample late.
@@ -126,7 +126,7 @@ def test_what_is_wrong_is_told_by_name(
 def test_the_example_is_a_plant() -> None:
     import numpy as np
 
-    from lab.rehearsal import factory_of
+    from dehyst.lab.rehearsal import factory_of
 
     made = factory_of(load_object("--plant", f"{ROOT / 'examples' / 'plant.py'}:Stage", ""))()
     true_um, read_um = made.run(np.linspace(0.0, 50.0, 200))
@@ -136,7 +136,7 @@ def test_the_example_is_a_plant() -> None:
 
 def test_readings_of_another_stage_steer_the_example_nowhere() -> None:
     """They move as fast as the stage for 64 ms, and were once taken for a shift of its zero."""
-    from lab.rehearsal import factory_of, rehearse, standard_events
+    from dehyst.lab.rehearsal import factory_of, rehearse, standard_events
 
     made = factory_of(load_object("--plant", f"{ROOT / 'examples' / 'plant.py'}:Stage", ""))
     event = standard_events(0, 4.0)[-1]
@@ -155,7 +155,7 @@ def test_only_what_went_wrong_makes_it_fail() -> None:
 def test_ctrl_c_ends_it_at_once_and_without_a_traceback(plant: Path, tmp_path: Path) -> None:
     arguments = ["rehearse", "--plant", f"{plant}:Stage", "--out", str(tmp_path / "out"), "--settle", "1000"]
     with subprocess.Popen(
-        [sys.executable, "-m", "lab.cli", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "dehyst.lab.cli", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     ) as process:  # fmt: skip
         assert process.stderr is not None

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.cli import main
-from lab.reproduce.measured import data_folder, run_stack
-from lab.reproduce.report import json_form, number, table
+from dehyst.lab.cli import main
+from dehyst.lab.reproduce.measured import data_folder, run_stack
+from dehyst.lab.reproduce.report import json_form, number, table
 
 FIGURES = {"2.2", "2.3", *(f"2.{n}" for n in range(8, 16)), *(f"2.{n}" for n in range(17, 21))}
 

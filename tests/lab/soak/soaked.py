@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from lab.soak.judge import assess, judge
-from lab.soak.observed import Counted, FaultRecord, Observations, QuerySecond, SampleSecond
-from lab.soak.report import soak_summary
+from dehyst.lab.soak.judge import assess, judge
+from dehyst.lab.soak.observed import Counted, FaultRecord, Observations, QuerySecond, SampleSecond
+from dehyst.lab.soak.report import soak_summary
 
 
 def healthy(

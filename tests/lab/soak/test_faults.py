@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from lab.soak import disturbers
-from lab.soak.controller import StageClock
-from lab.soak.disturbers import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
-from lab.soak.fault_plan import FAULT_KINDS
-from lab.soak.observed import INDICATORS
-from service.operating.verbs import decode_request
-from service.protocol import query as wire_query
-from service.protocol import samples as wire
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.soak import disturbers
+from dehyst.lab.soak.controller import StageClock
+from dehyst.lab.soak.disturbers import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
+from dehyst.lab.soak.fault_plan import FAULT_KINDS
+from dehyst.lab.soak.observed import INDICATORS
+from dehyst.service.operating.verbs import decode_request
+from dehyst.service.protocol import query as wire_query
+from dehyst.service.protocol import samples as wire
 
 #: What the promise names, and by which kind it is kept.
 PROMISED = {

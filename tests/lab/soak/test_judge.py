@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.soak.controller import ControlTask
-from lab.soak.fault_plan import FAULT_KINDS, make_plan
-from lab.soak.judge import MEMORY_MB, TRACKING_PCT, assess, recorded, unrecordable
-from lab.soak.observed import FaultRecord, Observations, SampleTracker
-from lab.soak.report import draw, report, verdict_line
-from service.protocol.samples import SampleBatch
-from service.storage.recorder import Recorder, RecorderConfig
+from dehyst.lab.soak.controller import ControlTask
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, make_plan
+from dehyst.lab.soak.judge import MEMORY_MB, TRACKING_PCT, assess, recorded, unrecordable
+from dehyst.lab.soak.observed import FaultRecord, Observations, SampleTracker
+from dehyst.lab.soak.report import draw, report, verdict_line
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)

@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from lab.soak.controller import ControlTask
-from lab.soak.prober import Prober
-from service.protocol.errors import NoReplyError
-from service.protocol.query import Answer, Point
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.soak.controller import ControlTask
+from dehyst.lab.soak.prober import Prober
+from dehyst.service.protocol.errors import NoReplyError
+from dehyst.service.protocol.query import Answer, Point
 
 CONTROL = ControlTask(1e-3, 10.0, 90.0, 1, 0.0, 100.0, 1000.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lab.soak.fault_plan import FAULT_KINDS, LATE_S, PlannedFault, Schedule, SoakPlan, make_plan
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, LATE_S, PlannedFault, Schedule, SoakPlan, make_plan
 
 
 def plan_of(*faults: PlannedFault, duration_s: float = 60.0) -> SoakPlan:

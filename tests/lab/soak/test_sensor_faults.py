@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.soak.actions import FaultActions
-from lab.soak.controller import STRAY, ControlTask, SoakReference
-from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, make_plan
-from lab.soak.judge import judge_sensor_fault, stage_gain
-from lab.soak.observed import FaultRecord, SampleTracker, troubles_since
-from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.stage_node.faults import Fault, Injector
+from dehyst.lab.soak.actions import FaultActions
+from dehyst.lab.soak.controller import STRAY, ControlTask, SoakReference
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, PlannedFault, make_plan
+from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
+from dehyst.lab.soak.observed import FaultRecord, SampleTracker, troubles_since
+from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
+from dehyst.service.stage_node.faults import Fault, Injector
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)

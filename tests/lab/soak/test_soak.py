@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from lab.commands.soak import seconds
-from lab.soak.controller import PERIOD_S, ControlTask, SoakReference
-from lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
-from lab.soak.observed import Intervals
-from service.stage_node.faults import Fault, Injector, decode_fault
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.commands.soak import seconds
+from dehyst.lab.soak.controller import PERIOD_S, ControlTask, SoakReference
+from dehyst.lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
+from dehyst.lab.soak.observed import Intervals
+from dehyst.service.stage_node.faults import Fault, Injector, decode_fault
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 

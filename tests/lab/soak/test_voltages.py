@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.soak.controller import AXIS, STAGE, ControlTask
-from lab.soak.observed import FaultRecord, Monitor, Observations, SampleTracker
-from service.protocol import samples as wire
-from service.runtime.session import open_router
+from dehyst.lab.soak.controller import AXIS, STAGE, ControlTask
+from dehyst.lab.soak.observed import FaultRecord, Monitor, Observations, SampleTracker
+from dehyst.service.protocol import samples as wire
+from dehyst.service.runtime.session import open_router
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.cli import main
-from service.adapters.epics import EpicsAxis
-from service.client.client import Client
-from service.protocol.keys import Keys
-from service.runtime.session import open_client
+from dehyst.lab.cli import main
+from dehyst.service.adapters.epics import EpicsAxis
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client
 
 pytestmark = pytest.mark.e2e
 p4p = pytest.importorskip("p4p.client.thread", reason="p4p is not installed (extra 'epics')")

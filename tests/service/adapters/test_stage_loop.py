@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.adapters import AdapterError, StageLoop, adapter, excitation, record, write_recording
-from service.adapters.adapter import Ticks
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.protocol.samples import encode_command
-from sim.recordings import ColumnMap, read
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.adapters import AdapterError, StageLoop, adapter, excitation, record, write_recording
+from dehyst.service.adapters.adapter import Ticks
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.samples import encode_command
+from dehyst.sim.recordings import ColumnMap, read
 
 
 class Clock:

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from adaptive.errors import InputError
-from service.adapters import simulated_pi
-from service.adapters.adapter import AdapterError, StageAdapter, Stated
-from service.adapters.jena import Nv200Stage
-from service.adapters.ni import NiStage
-from service.adapters.pi import PiStage
+from dehyst.adaptive.errors import InputError
+from dehyst.service.adapters import simulated_pi
+from dehyst.service.adapters.adapter import AdapterError, StageAdapter, Stated
+from dehyst.service.adapters.jena import Nv200Stage
+from dehyst.service.adapters.ni import NiStage
+from dehyst.service.adapters.pi import PiStage
 from tests.service.adapters.simulated_nv200 import SimulatedNv200
 
 needs_pipython = pytest.mark.skipif(
@@ -43,7 +43,7 @@ def at_its_limits(stage: StageAdapter) -> None:
 def pi_port() -> Iterator[int]:
     """The port of the simulated PI controller."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "service.adapters.simulated_pi", "--port", "0"], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "dehyst.service.adapters.simulated_pi", "--port", "0"], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     found = re.search(r"port (\d+)", process.stdout.readline())

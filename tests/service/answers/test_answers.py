@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adaptive.errors import InputError
-from adaptive.inverse_model import LssvmInverse
-from adaptive.types import Feedforward, FloatArray, InverseModel
-from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits, check_domain, guard, limit_voltage
-from service.answers.which_model import domain_weight, trust_by_age
-from service.config.settings import AxisConfig
-from service.protocol.model import StandIn, decode_model, encode_model
-from service.protocol.query import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel
+from dehyst.service.answers.fallback import Rules, answer_safely
+from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
+from dehyst.service.answers.which_model import domain_weight, trust_by_age
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.model import StandIn, decode_model, encode_model
+from dehyst.service.protocol.query import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -31,7 +31,7 @@ from service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
-from service.server.axis import Axis
+from dehyst.service.server.axis import Axis
 from tests.service.conftest import DT_S, make_models
 
 # --- What leaves is safe whatever the model says, and outside its domain the answer passes smoothly to the baseline.

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.answers import which_model
-from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits
-from service.answers.which_model import voltages_along
+from dehyst.service.answers import which_model
+from dehyst.service.answers.fallback import Rules, answer_safely
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.which_model import voltages_along
 from tests.service.conftest import make_models
 
 

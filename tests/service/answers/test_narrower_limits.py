@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.answers.guard import Limits
-from service.client.client import Client, Known
-from service.client.follower import Follower
-from service.config.settings import AxisConfig, read_config
-from service.protocol.errors import FieldError
-from service.protocol.model import encode_model
-from service.protocol.query import Answer, FeedforwardQuery, Pending, Trajectory
-from service.server.axis import Axis
-from service.server.process import Service
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client, Known
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.settings import AxisConfig, read_config
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.model import encode_model
+from dehyst.service.protocol.query import Answer, FeedforwardQuery, Pending, Trajectory
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.process import Service
 from tests.service.conftest import DT_S, make_models, unused_port, write_config
 from tests.service.living import Stage, eventually
 
@@ -79,7 +79,7 @@ def test_a_client_takes_the_answers_that_the_same_rule_leaves_as_they_are(
 
 
 def test_a_command_after_a_gap_does_not_leave_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.client.client.zenoh.SourceInfo", lambda *_: None)
+    monkeypatch.setattr("dehyst.service.client.client.zenoh.SourceInfo", lambda *_: None)
     querier = SimpleNamespace(id=None, undeclare=lambda: None)
     session: Any = SimpleNamespace(declare_querier=lambda *_, **__: querier)
     keys: Any = SimpleNamespace(feedforward="f", command="c")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks import vectors
-from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits
-from service.answers.slices import SLICE
-from service.protocol.model import decode_model
-from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STAND_IN
+from dehyst.service.answers.fallback import Rules, answer_safely
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.slices import SLICE
+from dehyst.service.protocol.model import decode_model
+from dehyst.service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STAND_IN
 
 N = 3 * SLICE + 77
 K = np.arange(N)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.sensor_trust import SENSOR_FAULTS
-from adaptive.state import restore, save
-from adaptive.types import InverseModel
-from baselines.competition.champion import ChampionInverse
-from service.answers.guard import Limits
-from service.answers.which_model import (
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.sensor_trust import SENSOR_FAULTS
+from dehyst.adaptive.state import restore, save
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.which_model import (
     MODELS,
     ROWS,
     RULES,
@@ -29,9 +29,9 @@ from service.answers.which_model import (
     rule_of,
     seen_in,
 )
-from service.client.follower import Follower
-from service.protocol.model import Safety, StandIn, encode_model
-from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
+from dehyst.service.client.follower import Follower
+from dehyst.service.protocol.model import Safety, StandIn, encode_model
+from dehyst.service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
 from tests.service.conftest import DT_S, make_models
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -56,7 +56,7 @@ SITUATIONS = {
 
 def test_the_page_is_up_to_date() -> None:
     committed = (DOCS / "which_model.md").read_text(encoding="utf-8")
-    assert committed == page(), "run: python -m service.answers.which_model > docs/which_model.md"
+    assert committed == page(), "run: python -m dehyst.service.answers.which_model > docs/which_model.md"
 
 
 @pytest.mark.parametrize(("before", "after"), list(itertools.product(SITUATIONS, repeat=2)))

@@ -15,25 +15,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import InverseModel
-from service.answers.guard import Limits
-from service.background.diagnosis_worker import diagnose
-from service.background.job import BackgroundJob
-from service.background.settings import WatchConfig
-from service.background.watcher import WORKER, Watcher
-from service.client.client import Client
-from service.config.settings import AxisConfig
-from service.identification.identifying import identify_one
-from service.protocol import samples as wire
-from service.protocol.samples import SampleBatch
-from service.runtime.session import SURELY, open_client
-from service.server.axis import Axis
-from service.storage.model_file import BundleMeta, read_bundle, write_bundle
-from sim.signals.references import demo_reference
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.background.diagnosis_worker import diagnose
+from dehyst.service.background.job import BackgroundJob
+from dehyst.service.background.settings import WatchConfig
+from dehyst.service.background.watcher import WORKER, Watcher
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.identification.identifying import identify_one
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.server.axis import Axis
+from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
+from dehyst.sim.signals.references import demo_reference
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.online_models import PlainModel
 from tests.service.background.test_diagnosing_parts import DT_S, batch
 
@@ -289,8 +289,9 @@ def test_a_stage_that_rests_gives_no_reference(model_file: Path) -> None:
 
 def test_watching_brings_neither_torch_nor_plots_into_the_service() -> None:
     code = (
-        "import sys, service.server.process, service.background.watcher;"
-        "print([m for m in ('torch', 'matplotlib', 'rerun', 'sim.diagnosis', 'sim.changes') if m in sys.modules])"
+        "import sys, dehyst.service.server.process, dehyst.service.background.watcher\n"
+        "heavy = ('torch', 'matplotlib', 'rerun', 'dehyst.sim.diagnosis', 'dehyst.sim.changes')\n"
+        "print([m for m in heavy if m in sys.modules])"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert ended.stdout.strip() == "[]"
@@ -311,7 +312,7 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
     )
     u_V = voltages(model_file, 20.0)
     began_at = time.time()
-    cli = [sys.executable, "-m", "lab.cli"]
+    cli = [sys.executable, "-m", "dehyst.lab.cli"]
     serve = subprocess.Popen([*cli, "serve", "--config", str(config), "--json"], stdout=subprocess.PIPE, text=True)
     stage = None
     try:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.background.settings import WatchConfig
-from service.background.watcher import Alarm, Levels, SampleBuffer
-from service.config.settings import parse_config
-from service.protocol.errors import FieldError
-from service.protocol.samples import SampleBatch
+from dehyst.service.background.settings import WatchConfig
+from dehyst.service.background.watcher import Alarm, Levels, SampleBuffer
+from dehyst.service.config.settings import parse_config
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import SampleBatch
 
 DT_S = 1e-3
 

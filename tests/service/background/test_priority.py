@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.background import job as priority
+from dehyst.service.background import job as priority
 
 AUTOGROUP = Path("/proc/self/autogroup")
 autogroups = pytest.mark.skipif(
@@ -18,7 +18,7 @@ autogroups = pytest.mark.skipif(
 
 STEPPED = """
 import os, pathlib
-from service.background.job import step_back
+from dehyst.service.background.job import step_back
 group = pathlib.Path("/proc/self/autogroup")
 before = group.read_text() if group.exists() else ""
 step_back(7)

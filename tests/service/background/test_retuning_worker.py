@@ -15,22 +15,22 @@ import numpy as np
 import psutil
 import pytest
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.tuning import retuning as retune
-from adaptive.tuning.config import RetuneConfig
-from adaptive.types import FloatArray, Hyperparameters, WindowData
-from service.answers.guard import Limits
-from service.background.retuner import Retuner
-from service.background.retuning_worker import pack, start_job, tuned
-from service.background.settings import RetuningConfig
-from service.config.settings import AxisConfig
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.model_file import Bundle, BundleMeta
-from sim.signals.voltages import multitone, training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.tuning import retuning as retune
+from dehyst.adaptive.tuning.config import RetuneConfig
+from dehyst.adaptive.types import FloatArray, Hyperparameters, WindowData
+from dehyst.service.answers.guard import Limits
+from dehyst.service.background.retuner import Retuner
+from dehyst.service.background.retuning_worker import pack, start_job, tuned
+from dehyst.service.background.settings import RetuningConfig
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.sim.signals.voltages import multitone, training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT_S, BLOCK = 1e-3, 20
 NARROW = Hyperparameters(1e5, (0.12, 0.12))
@@ -144,7 +144,7 @@ class Working:
 @pytest.fixture
 def retuner(monkeypatch: pytest.MonkeyPatch) -> Iterator[Retuner]:
     Working.made = 0
-    monkeypatch.setattr("service.background.retuner.start_job", Working)
+    monkeypatch.setattr("dehyst.service.background.retuner.start_job", Working)
     made = Retuner(RetuningConfig(period_s=0.0, fresh=100))
     yield made
     made.close()

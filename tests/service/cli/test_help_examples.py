@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
-from lab.cli import COMMANDS, main
-from service.cli.main import build_parser
+from dehyst.lab.cli import COMMANDS, main
+from dehyst.service.cli.main import build_parser
 from tests.service.conftest import ServeProcess, unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -79,7 +79,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_as_printed(example: str, folder: Path, *more: str) -> str:
     """Run an example in ``folder``; returns what it prints."""
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", *words(example), *more],
+        [sys.executable, "-m", "dehyst.lab.cli", *words(example), *more],
         cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, f"{example}\n{done.stdout}\n{done.stderr}"
@@ -117,7 +117,7 @@ def test_look_runs_as_printed(folder: Path) -> None:
     """The first example finds two columns in V and asks; the second says which is which."""
     asking, understood = examples("look")
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", *words(asking)],
+        [sys.executable, "-m", "dehyst.lab.cli", *words(asking)],
         cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     assert done.returncode == 1
@@ -202,7 +202,7 @@ def test_examples_that_serve_come_up_as_printed(folder: Path) -> None:
 def comes_up(example: str, folder: Path, *more: str, then: Callable[[], None] = lambda: None) -> None:
     """Start an example that serves, until its first line; call ``then``, and end it by Ctrl-C."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "lab.cli", *words(example), *more],
+        [sys.executable, "-m", "dehyst.lab.cli", *words(example), *more],
         cwd=folder, env=environment(), stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

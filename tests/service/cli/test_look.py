@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.cli import main
+from dehyst.lab.cli import main
 
 N, DT_S = 1500, 1e-3
 T = np.arange(N) * DT_S

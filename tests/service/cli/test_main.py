@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.cli import COMMANDS, main
-from service.cli.main import COMMANDS as SERVICE_COMMANDS
-from service.cli.main import GROUPS, build_parser
+from dehyst.lab.cli import COMMANDS, main
+from dehyst.service.cli.main import COMMANDS as SERVICE_COMMANDS
+from dehyst.service.cli.main import GROUPS, build_parser
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCUMENTED = """
@@ -69,7 +69,7 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_service_alone_has_no_experiments() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "dehyst.service.cli", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert "serve" in done.stdout
     assert "soak" not in done.stdout
@@ -98,7 +98,7 @@ def test_completion_knows_commands_and_options(shell: str, capsys: pytest.Captur
 
 def test_bash_completes_from_the_script(tmp_path: Path) -> None:
     script = tmp_path / "dehyst.bash"
-    command = [sys.executable, "-m", "lab.cli", "completion", "bash"]
+    command = [sys.executable, "-m", "dehyst.lab.cli", "completion", "bash"]
     printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     script.write_text(printed, encoding="utf-8")
     ask = (
@@ -126,7 +126,12 @@ def test_help_can_be_read_in_any_encoding(command: str, encoding: str, monkeypat
 def run_into(out: object, *words: str) -> tuple[int, str]:
     """(exit status, what is said on stderr) of a command whose output goes to ``out``."""
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", *words], cwd=ROOT, stdout=out, stderr=subprocess.PIPE, text=True, check=False
+        [sys.executable, "-m", "dehyst.lab.cli", *words],
+        cwd=ROOT,
+        stdout=out,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
     )  # type: ignore[call-overload]
     return done.returncode, done.stderr
 
@@ -166,7 +171,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_computed(
     u_V = 4.0 + 3.0 * np.sin(2.0 * np.pi * k / 400)
     rows = np.column_stack([k * 1e-3, u_V, 10.0 * u_V + 1.0])
     np.savetxt(data, rows, delimiter=",", header="t_s,u_V,y_um", comments="", fmt="%.9g")
-    for module, name in (("sim.diagnosis.prepare", "prepare"), ("sim.modal", "study")):
+    for module, name in (("dehyst.sim.diagnosis.prepare", "prepare"), ("dehyst.sim.modal", "study")):
         monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("it computes"))
     assert main([command, str(data), "--out", "/proc", *(["--period", "400"] if command == "modes" else [])]) == 2
     assert "--out: got /proc, expected a folder that can be written to" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.cli import main
+from dehyst.lab.cli import main
 
 DT_S = 1e-3
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from adaptive.errors import InputError
-from lab.cli import main
-from service.answers.answering import derivatives
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.delta import FollowedState
-from service.protocol.errors import (
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.cli import main
+from dehyst.service.answers.answering import derivatives
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.delta import FollowedState
+from dehyst.service.protocol.errors import (
     BehindError,
     NoReplyError,
     RefusedError,
@@ -31,11 +31,11 @@ from service.protocol.errors import (
     error_from_json,
     error_to_json,
 )
-from service.protocol.keys import Keys
-from service.protocol.model import decode_model
-from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN, FeedforwardQuery
-from service.runtime.session import open_client, open_service
-from service.security.authenticator import own_authenticator
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import decode_model
+from dehyst.service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN, FeedforwardQuery
+from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.security.authenticator import own_authenticator
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
@@ -418,7 +418,7 @@ def test_the_command_asks_a_running_service(
 
 def test_the_command_as_a_process_ends_with_a_status(free_port: int) -> None:
     ended = subprocess.run(
-        [sys.executable, "-m", "lab.cli", "query", "12", "--endpoint", f"tcp/127.0.0.1:{free_port}"],
+        [sys.executable, "-m", "dehyst.lab.cli", "query", "12", "--endpoint", f"tcp/127.0.0.1:{free_port}"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert ended.returncode == 2

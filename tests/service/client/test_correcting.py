@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.client.correcting import Correcting
-from service.client.follower import Follower
-from service.config.correction import CorrectionConfig, RepetitionConfig
-from service.protocol.delta import FollowedState
-from service.protocol.errors import FieldError
-from service.protocol.model import ModelMessage, Safety, decode_model, encode_model
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.client.correcting import Correcting
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.service.protocol.delta import FollowedState
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.model import ModelMessage, Safety, decode_model, encode_model
 from tests.service.conftest import make_models
 
 DT_S = 1e-3

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.client.client import Client
-from service.failover.state_transfer import status_of
-from service.protocol.errors import BusyError, RefusedError, error_from_json
-from service.protocol.keys import Keys
-from service.protocol.query import encode_query
-from service.runtime.session import open_client, open_service
-from service.security.authenticator import own_authenticator
+from dehyst.service.client.client import Client
+from dehyst.service.failover.state_transfer import status_of
+from dehyst.service.protocol.errors import BusyError, RefusedError, error_from_json
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import encode_query
+from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.security.authenticator import own_authenticator
 
 pytestmark = pytest.mark.e2e
 N = 40_000

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.competition.champion import ChampionInverse
-from service.answers.answering import MemoryTracker
-from service.answers.guard import Limits
-from service.client.follower import Follower
-from service.config.settings import AxisConfig
-from service.protocol.model import Safety, decode_model, encode_model
-from service.protocol.query import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.competition.champion import ChampionInverse
+from dehyst.service.answers.answering import MemoryTracker
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.model import Safety, decode_model, encode_model
+from dehyst.service.protocol.query import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -30,7 +30,7 @@ from service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
-from service.server.axis import Axis
+from dehyst.service.server.axis import Axis
 from tests.service.conftest import make_models
 
 LIMITS = Limits(0.0, 7.0, 2000.0, -50.0, 150.0)

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import service
 from benchmarks import vectors
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.client.follower import Follower
-from service.protocol.model import decode_model
+from dehyst import service
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.client.follower import Follower
+from dehyst.service.protocol.model import decode_model
 
 OTHERS = (
     "numba", "llvmlite", "scipy", "pyarrow", "matplotlib", "rerun", "psutil", "threadpoolctl", "h5py", "nptdms",
@@ -49,10 +49,10 @@ EVALUATE = """
 import json, sys
 from pathlib import Path
 import numpy as np
-from adaptive.compiled import COMPILES
-from service.answers.guard import Limits
-from service.client.follower import Follower
-from service.protocol.model import decode_model
+from dehyst.adaptive.compiled import COMPILES
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.follower import Follower
+from dehyst.service.protocol.model import decode_model
 assert not COMPILES
 found = {}
 for path in sys.argv[1:]:
@@ -88,7 +88,7 @@ def test_every_kind_of_model_has_the_same_voltages_in_numpy_alone() -> None:
 CONNECT = """
 import json, sys
 import numpy as np
-from service.client import Client
+from dehyst.service.client import Client
 with Client.connect(sys.argv[1], timeout_s=10.0) as client:
     y = 40.0 + 5.0 * np.sin(0.05 * np.arange(300))
     asked = client.trajectory(y, model="lssvm_adaptive")
@@ -112,9 +112,11 @@ def test_a_thin_client_connects_asks_follows_and_commands(shared_service: Any) -
 
 def test_all_of_the_service_can_be_imported_without_fcntl() -> None:
     modules = sorted(
-        name for _, name, _ in pkgutil.walk_packages(service.__path__, "service.") if not name.endswith("__main__")
+        name
+        for _, name, _ in pkgutil.walk_packages(service.__path__, "dehyst.service.")
+        if not name.endswith("__main__")
     )
-    assert {"service.server.process", "service.storage.segments"} <= set(modules)
+    assert {"dehyst.service.server.process", "dehyst.service.storage.segments"} <= set(modules)
     program = (
         "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\nprint(len(sys.argv))"
     )
@@ -135,7 +137,7 @@ def locking(descriptor, mode, size):
 fake.locking = locking
 sys.modules["msvcrt"] = fake
 from pathlib import Path
-from service.storage.owner import FolderOwner
+from dehyst.service.storage.owner import FolderOwner
 FolderOwner(Path(sys.argv[1]), "lock", "demo/x").take()
 try:
     FolderOwner(Path(sys.argv[1]), "lock", "demo/x").take()
@@ -145,7 +147,7 @@ except BlockingIOError as error:
     assert result_of(run_without(("fcntl",), program, str(tmp_path))) == ["refused"]
 
 
-COMMAND = "from lab.cli import main\nsys.exit(main(sys.argv[1:]))"
+COMMAND = "from dehyst.lab.cli import main\nsys.exit(main(sys.argv[1:]))"
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.types import FloatArray, InverseModel
-from service.answers.fallback import FADE_S
-from service.client.client import UNDER_WAY, Client, continued, pending_before, with_pending
-from service.protocol.errors import FieldError
-from service.protocol.query import (
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.service.answers.fallback import FADE_S
+from dehyst.service.client.client import UNDER_WAY, Client, continued, pending_before, with_pending
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.query import (
     MAX_PENDING,
     Answer,
     FeedforwardQuery,

@@ -18,20 +18,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from service.adapters import adapter, simulated_pi
-from service.adapters.adapter import AdapterError, Stated
-from service.adapters.pi import PiStage
-from service.adapters.simulated_pi import SimulatedPi
-from service.answers.guard import Limits
-from service.cli.main import main
-from service.commissioning import commission as rounds
-from service.commissioning import mover
-from service.commissioning.commission import commission, response
-from service.commissioning.mover import Order, Piece, StageFault
-from service.config.settings import read_config
-from service.runtime.stopping import STOPS
-from service.storage.model_file import read_bundle
+from dehyst.adaptive.errors import InputError
+from dehyst.service.adapters import adapter, simulated_pi
+from dehyst.service.adapters.adapter import AdapterError, Stated
+from dehyst.service.adapters.pi import PiStage
+from dehyst.service.adapters.simulated_pi import SimulatedPi
+from dehyst.service.answers.guard import Limits
+from dehyst.service.cli.main import main
+from dehyst.service.commissioning import commission as rounds
+from dehyst.service.commissioning import mover
+from dehyst.service.commissioning.commission import commission, response
+from dehyst.service.commissioning.mover import Order, Piece, StageFault
+from dehyst.service.config.settings import read_config
+from dehyst.service.runtime.stopping import STOPS
+from dehyst.service.storage.model_file import read_bundle
 from tests.service.conftest import unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -49,7 +49,7 @@ needs_pipython = pytest.mark.skipif(
 def controller(*words: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """(the process of a simulated PI controller, its port)."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "service.adapters.simulated_pi", "--port", "0", *words],
+        [sys.executable, "-m", "dehyst.service.adapters.simulated_pi", "--port", "0", *words],
         stdout=subprocess.PIPE, text=True, cwd=ROOT, env=ENVIRONMENT,
     )  # fmt: skip
     try:
@@ -164,7 +164,7 @@ def test_a_controller_that_is_gone_leaves_its_voltage_and_that_is_said(tmp_path:
 def stage_file(folder: Path, port: int) -> list[str]:
     """Arguments of the command for a stage at this port, whose file it writes."""
     stage = f"PiStage('127.0.0.1', port={port}, rate_Hz=50.0)"
-    program = f"from service.adapters.pi import PiStage\ndef open_stage():\n    return {stage}\n"
+    program = f"from dehyst.service.adapters.pi import PiStage\ndef open_stage():\n    return {stage}\n"
     (folder / "mine.py").write_text(program)
     return ["--adapter", "mine.py:open_stage", "--u-min", "0", "--u-max", "80", "--slew", "400", "--out", "out"]
 
@@ -177,7 +177,7 @@ def test_the_command_takes_three_minutes_at_most_and_its_model_is_served(tmp_pat
     """With a target that a loaded machine reaches, where many samples come late."""
     with controller() as (_, port):
         done = subprocess.run(
-            [sys.executable, "-m", "service.cli", "commission", *stage_file(tmp_path, port), "--target", "2"],
+            [sys.executable, "-m", "dehyst.service.cli", "commission", *stage_file(tmp_path, port), "--target", "2"],
             cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=300,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -188,7 +188,7 @@ def test_the_command_takes_three_minutes_at_most_and_its_model_is_served(tmp_pat
     config = out / "serve.toml"
     config.write_text(config.read_text().replace("7447", str(unused_port())))
     with subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "serve", "--config", str(config)],
+        [sys.executable, "-m", "dehyst.service.cli", "serve", "--config", str(config)],
         cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
     ) as service:  # fmt: skip
         assert service.stdout is not None
@@ -203,7 +203,7 @@ def test_the_command_takes_three_minutes_at_most_and_its_model_is_served(tmp_pat
 def test_ctrl_c_ramps_the_stage_back_and_keeps_the_recording(tmp_path: Path) -> None:
     with controller() as (_, port):
         with subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "commission", *stage_file(tmp_path, port)],
+            [sys.executable, "-m", "dehyst.service.cli", "commission", *stage_file(tmp_path, port)],
             cwd=tmp_path, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True,
         ) as process:  # fmt: skip
             assert process.stderr is not None

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.online.config import LearnerConfig
-from service.config.reference import example, page
-from service.config.schema import build_settings
-from service.config.settings import parse_config, read_config
-from service.protocol.errors import FieldError
-from service.runtime.session import check_endpoint, is_loopback
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.service.config.reference import example, page
+from dehyst.service.config.schema import build_settings
+from dehyst.service.config.settings import parse_config, read_config
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.session import check_endpoint, is_loopback
 
 GOOD = """
 stage = "demo"
@@ -72,7 +72,7 @@ def test_the_page_of_the_configuration_is_the_schema() -> None:
         return [line.split(" | ")[:3] for line in text.splitlines() if line.startswith("| `")]
 
     assert len(cells(committed)) > 90
-    assert cells(committed) == cells(page()), "run: python -m service.config.reference > docs/configuration.md"
+    assert cells(committed) == cells(page()), "run: python -m dehyst.service.config.reference > docs/configuration.md"
 
 
 @pytest.mark.parametrize(

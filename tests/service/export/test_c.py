@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray, InverseModel
-from service.answers.answering import derivatives
-from service.answers.guard import Limits, limit_voltage
-from service.export import Frozen, write_export
-from service.export.c_source import domain
-from service.export.exporting import trial_motion, voltages
-from service.protocol.model import decode_model
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.service.answers.answering import derivatives
+from dehyst.service.answers.guard import Limits, limit_voltage
+from dehyst.service.export import Frozen, write_export
+from dehyst.service.export.c_source import domain
+from dehyst.service.export.exporting import trial_motion, voltages
+from dehyst.service.protocol.model import decode_model
 from tests.service.export.compiled import STRICT, Run, compiled, needs_a_compiler
 
 pytestmark = needs_a_compiler

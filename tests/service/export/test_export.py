@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.cli import main
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.export import Frozen, write_export
-from service.export.exporting import Periodic, trial_motion, voltages
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.lab.cli import main
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.export import Frozen, write_export
+from dehyst.service.export.exporting import Periodic, trial_motion, voltages
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, ServeProcess, make_models
 from tests.service.export.compiled import STRICT, needs_a_compiler
 

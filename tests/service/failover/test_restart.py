@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.client.client import Client
-from service.config.settings import read_config
-from service.protocol.model import fingerprint
-from service.protocol.query import STALE
-from service.runtime.session import open_client, open_service
-from service.server.axis_loading import load_axis
-from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
-from service.storage.model_file import BundleMeta, write_bundle
-from sim.recordings import read
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import read_config
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.protocol.query import STALE
+from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.checkpoint import CheckpointFolder, decode_checkpoint
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from dehyst.sim.recordings import read
 from tests.service.conftest import DT_S, make_models, unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually, samples
 

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.client.client import Client
-from service.failover.role_control import Claims
-from service.operating.remote import operate
-from service.protocol.keys import Keys
-from service.runtime.session import open_client
-from service.security.authenticator import NO_KEY, own_authenticator
-from service.security.tokens import Claim
-from sim.recordings import read
+from dehyst.service.client.client import Client
+from dehyst.service.failover.role_control import Claims
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client
+from dehyst.service.security.authenticator import NO_KEY, own_authenticator
+from dehyst.service.security.tokens import Claim
+from dehyst.sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
 
@@ -291,7 +291,7 @@ def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processe
     processes.append(Process("serve", "--config", str(config)))
     program = (
         "import sys, time\n"
-        "from service.runtime.session import open_client\n"
+        "from dehyst.service.runtime.session import open_client\n"
         "s = open_client(sys.argv[1])\n"
         "sub = s.declare_subscriber('dehyst/v1/demo/x/**', lambda _: None)\n"
         "print('watching', flush=True)\n"
@@ -344,7 +344,7 @@ def test_the_greatest_claim_serves() -> None:
 
 def test_a_standby_needs_ears_of_its_own(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", "serve", "--config", str(write_config(tmp_path, 1)), "--standby"],
+        [sys.executable, "-m", "dehyst.lab.cli", "serve", "--config", str(write_config(tmp_path, 1)), "--standby"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 2

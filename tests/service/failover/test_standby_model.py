@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive.errors import ModelFileError
-from service.failover.standby_model import (
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.service.failover.standby_model import (
     NOT_SYNCED,
     PeerFiles,
     StandbyModel,
@@ -21,11 +21,11 @@ from service.failover.standby_model import (
     restore_from_peer,
     standby_folder,
 )
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loop import AxisLoop
-from service.storage.checkpoint import encode_checkpoint, restore_newest
-from service.storage.recorder import Recorder, RecorderConfig
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.storage.checkpoint import encode_checkpoint, restore_newest
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
 from tests.service.axes import loop_of
 from tests.service.storage.test_stored_files import folder, make_axis, meta, recording, same
 

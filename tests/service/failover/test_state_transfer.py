@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from service.failover.state_transfer import fetch_state, part_of
-from service.protocol.errors import FieldError
-from service.runtime.session import open_client, open_router
+from dehyst.service.failover.state_transfer import fetch_state, part_of
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.session import open_client, open_router
 from tests.service.conftest import unused_port
 
 KEY, SAMPLES, ECHO = "handover/state", "handover/sample", "handover/echo"
@@ -25,8 +25,8 @@ STATE = os.urandom(4_700_000)
 
 _ASKER = """
 import sys
-from service.failover.state_transfer import fetch_state
-from service.runtime.session import open_client
+from dehyst.service.failover.state_transfer import fetch_state
+from dehyst.service.runtime.session import open_client
 with open_client(sys.argv[1], 10.0) as session:
     print("ready", flush=True)
     whole = 0

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from service.client.client import Client
-from service.failover.role_control import Claims
-from service.failover.state_transfer import fetch_state, part_of, status_of, tell_standbys
-from service.protocol.errors import ServiceError
-from service.protocol.keys import Keys
-from service.runtime.session import open_client, open_router
-from service.security.authenticator import EVERYBODY, NO_KEY, Authenticator
-from service.security.tokens import Claim
+from dehyst.service.client.client import Client
+from dehyst.service.failover.role_control import Claims
+from dehyst.service.failover.state_transfer import fetch_state, part_of, status_of, tell_standbys
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client, open_router
+from dehyst.service.security.authenticator import EVERYBODY, NO_KEY, Authenticator
+from dehyst.service.security.tokens import Claim
 from tests.service.conftest import unused_port
 from tests.service.failover.test_standby import pair_config
 from tests.service.living import Process, Stage, eventually

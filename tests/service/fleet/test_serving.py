@@ -15,29 +15,29 @@ import numpy as np
 import pytest
 import zenoh
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.fleet.fleet import Fleet, FleetConfig
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import Learner
-from adaptive.types import Sample, prefixed, under
-from service.answers.guard import Limits
-from service.client.follower import Follower
-from service.config.learner import learner_config
-from service.config.settings import AxisConfig, parse_config
-from service.fleet import wire
-from service.fleet.checkpoints import FleetCheckpoints
-from service.operating.remote import operate
-from service.protocol.errors import RefusedError
-from service.protocol.keys import Keys
-from service.protocol.model import decode_model, digests
-from service.protocol.query import LIMITED_VOLTAGE
-from service.protocol.samples import SampleBatch
-from service.runtime.session import open_client
-from service.security.authenticator import Authenticator
-from service.server.axis_loading import load_axis
-from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
-from service.storage.model_file import Bundle, BundleMeta, write_bundle
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import Sample, prefixed, under
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.learner import learner_config
+from dehyst.service.config.settings import AxisConfig, parse_config
+from dehyst.service.fleet import wire
+from dehyst.service.fleet.checkpoints import FleetCheckpoints
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol.errors import RefusedError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import decode_model, digests
+from dehyst.service.protocol.query import LIMITED_VOLTAGE
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.runtime.session import open_client
+from dehyst.service.security.authenticator import Authenticator
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
+from dehyst.service.storage.model_file import Bundle, BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
 DT_S, AXES = 1e-3, 64
@@ -459,8 +459,8 @@ def test_a_configuration_names_what_does_not_fit(tmp_path: Path) -> None:
 
 def test_a_service_without_a_fleet_imports_neither_torch_nor_fleet() -> None:
     code = (
-        "import sys, service.server.process, service.cli.commands.serve, service.config.settings\n"
-        "sys.exit(bool({'torch', 'adaptive.fleet.fleet', 'service.fleet.serving'} & set(sys.modules)))"
+        "import sys, dehyst.service.server.process, dehyst.service.cli.commands.serve, dehyst.service.config.settings\n"
+        "sys.exit(bool({'torch', 'dehyst.adaptive.fleet.fleet', 'dehyst.service.fleet.serving'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
 
@@ -470,7 +470,7 @@ def test_without_torch_the_extra_is_named(tmp_path: Path) -> None:
     more = 'device = "cuda"\nlearner = { solver = { form = "inverse" } }\n'
     (tmp_path / "serve.toml").write_text(configuration(unused_port(), more), encoding="utf-8")
     code = (
-        "import sys; sys.modules['torch'] = None\nfrom lab.cli import main\n"
+        "import sys; sys.modules['torch'] = None\nfrom dehyst.lab.cli import main\n"
         f"sys.exit(main(['serve', '--config', {str(tmp_path / 'serve.toml')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

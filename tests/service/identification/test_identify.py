@@ -12,17 +12,25 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from baselines.prandtl_ishlinskii.model import MpiParameters
-from lab.cli import main
-from service.identification import identifying
-from service.identification.identifying import NAMES, Stretch, free_run, identify_all, motion_of, split_at, thinning
-from service.identification.recording_options import parse_range
-from service.storage.model_file import read_bundle
-from sim.recordings import Recording, Repaired, repaired
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
+from dehyst.lab.cli import main
+from dehyst.service.identification import identifying
+from dehyst.service.identification.identifying import (
+    NAMES,
+    Stretch,
+    free_run,
+    identify_all,
+    motion_of,
+    split_at,
+    thinning,
+)
+from dehyst.service.identification.recording_options import parse_range
+from dehyst.service.storage.model_file import read_bundle
+from dehyst.sim.recordings import Recording, Repaired, repaired
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
 

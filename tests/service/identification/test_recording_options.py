@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from nptdms import ChannelObject, TdmsWriter
 
-from adaptive.errors import InputError
-from lab.cli import main
-from service.identification.recording_options import add_mapping_arguments, load, mapping_from
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.cli import main
+from dehyst.service.identification.recording_options import add_mapping_arguments, load, mapping_from
 
 ROOT = Path(__file__).resolve().parents[3]
 N, PERIODS, DT_S = 400, 4, 0.002
@@ -109,7 +109,7 @@ def test_identify_reads_a_table_without_names_and_judges_on_a_tdms_file(
 
 def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "lab.cli", *arguments],
+        [sys.executable, "-m", "dehyst.lab.cli", *arguments],
         cwd=cwd,
         env={"PYTHONPATH": f"{ROOT}:{':'.join(path for path in sys.path if path)}", "PATH": "", "HOME": str(cwd)},
         capture_output=True,

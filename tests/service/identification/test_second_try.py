@@ -20,10 +20,10 @@ import pytest
 from pyarrow import feather, parquet
 from scipy.io import savemat
 
-from adaptive.errors import InputError
-from service.identification.recording_options import add_mapping_arguments, mapping_from
-from sim.recordings import Recording, read
-from sim.recordings.columns import ColumnMap, MissingError, unit_of_name
+from dehyst.adaptive.errors import InputError
+from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from
+from dehyst.sim.recordings import Recording, read
+from dehyst.sim.recordings.columns import ColumnMap, MissingError, unit_of_name
 
 N, DT_S = 3000, 1e-3
 T_S = np.arange(N) * DT_S

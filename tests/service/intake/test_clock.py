@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import ModelFileError
-from adaptive.online.learner import Learner
-from adaptive.state import restore, save
-from adaptive.types import InverseModel
-from service.intake.sequence import RESYNC_AFTER, SET_AFTER, SampleClock
-from service.protocol.samples import SampleBatch
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import restore, save
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.intake.sequence import RESYNC_AFTER, SET_AFTER, SampleClock
+from dehyst.service.protocol.samples import SampleBatch
 from tests.service.server.test_axis import make_axis, recording
 
 DT_S = 1e-3

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.intake.command_witness import DIFFERS_FROM, CommandWitness
-from service.protocol.query import Pending
+from dehyst.service.intake.command_witness import DIFFERS_FROM, CommandWitness
+from dehyst.service.protocol.query import Pending
 
 SPAN_V = 10.0
 #: Samples after which a controller that moves the stage is believed.

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from adaptive.types import InverseModel
-from service.intake.sample_queue import MOST_TOGETHER
-from service.protocol.errors import ServiceError
-from service.protocol.samples import SampleBatch
-from service.server import axis_loop
-from service.server.axis_loop import AxisLoop
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.intake.sample_queue import MOST_TOGETHER
+from dehyst.service.protocol.errors import ServiceError
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server import axis_loop
+from dehyst.service.server.axis_loop import AxisLoop
 from tests.service.axes import loop_of
 from tests.service.living import eventually
 from tests.service.server.test_axis import make_axis, parts, recording

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.health import (
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.health import (
     SAMPLES_DROPPED,
     SAMPLES_LOST,
     SAMPLES_MALFORMED,

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import ModelFileError
-from adaptive.state import restore, save
-from adaptive.types import InverseModel, prefixed
-from service.intake.sequence import (
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.state import restore, save
+from dehyst.adaptive.types import InverseModel, prefixed
+from dehyst.service.intake.sequence import (
     AHEAD,
     IN_ORDER,
     JUMPED,
@@ -24,15 +24,15 @@ from service.intake.sequence import (
     RESTARTED,
     SequenceTracker,
 )
-from service.intake.sequence import (
+from dehyst.service.intake.sequence import (
     MOST_CONFIRMATIONS as MOST,
 )
-from service.protocol.model import fingerprint
-from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.replay import sequence
-from service.server.axis import Axis
-from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
-from sim.recordings import Recording
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
+from dehyst.service.replay import sequence
+from dehyst.service.server.axis import Axis
+from dehyst.service.storage.checkpoint import decode_checkpoint, encode_checkpoint
+from dehyst.sim.recordings import Recording
 from tests.service.axes import loop_of
 from tests.service.server.test_axis import make_axis, recording
 from tests.service.storage.test_stored_files import make_axis as make_competing

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.intake.sample_queue import Thinner
-from service.protocol.samples import SampleBatch
+from dehyst.service.intake.sample_queue import Thinner
+from dehyst.service.protocol.samples import SampleBatch
 
 
 def batch(first: int, n: int) -> SampleBatch:

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from service.client.client import Client
-from service.operating.remote import operate
-from service.runtime.session import open_client, wait_followed
+from dehyst.service.client.client import Client
+from dehyst.service.operating.remote import operate
+from dehyst.service.runtime.session import open_client, wait_followed
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually, samples
 

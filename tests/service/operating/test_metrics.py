@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from adaptive.errors import InputError
-from lab.cli import main
-from service.cli.commands.status import _check
-from service.operating import metrics
-from service.operating.metrics import page, serve_page
-from service.operating.remote import table
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.cli import main
+from dehyst.service.cli.commands.status import _check
+from dehyst.service.operating import metrics
+from dehyst.service.operating.metrics import page, serve_page
+from dehyst.service.operating.remote import table
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

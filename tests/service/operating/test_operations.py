@@ -21,17 +21,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy import arange, pi, sin
 
-from adaptive.errors import InputError
-from lab.cli import main
-from service.client.client import Client
-from service.operating.remote import operate, screen, statuses, table
-from service.operating.server import RESERVE, Journal, OperationsServer, Switch
-from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
-from service.protocol import samples as wire
-from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
-from service.protocol.keys import Keys
-from service.runtime.session import open_client, open_service
-from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.cli import main
+from dehyst.service.client.client import Client
+from dehyst.service.operating.remote import operate, screen, statuses, table
+from dehyst.service.operating.server import RESERVE, Journal, OperationsServer, Switch
+from dehyst.service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_authenticator
 from tests.service.living import eventually
 
 KEYS = Keys("demo", "x")
@@ -547,7 +547,7 @@ def test_the_commands_against_a_real_service(
 def test_the_live_table_goes_on_until_ctrl_c_and_ends_cleanly(serve: Callable[..., Any]) -> None:
     process = serve()
     live = subprocess.Popen(
-        [sys.executable, "-m", "lab.cli", "status", "--endpoint", process.endpoint, "--period", "0.2", "--json"],
+        [sys.executable, "-m", "dehyst.lab.cli", "status", "--endpoint", process.endpoint, "--period", "0.2", "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert live.stdout is not None

@@ -16,15 +16,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError, ModelFileError
 from benchmarks.fuzz_targets import EXPECTED, TARGETS, WORDS, seeds
 from benchmarks.mutations import mutated
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.errors import error_from_json
-from service.protocol.model import decode_model
-from service.runtime.session import open_client
-from service.stage_node.faults import decode_fault
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import error_from_json
+from dehyst.service.protocol.model import decode_model
+from dehyst.service.runtime.session import open_client
+from dehyst.service.stage_node.faults import decode_fault
 from tests.service.conftest import ServeProcess
 
 DECODE = {name: make() for name, make in TARGETS.items()}

@@ -17,16 +17,16 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.types import InverseModel
-from service.protocol import query as wire_flags
-from service.protocol import query as wire_query
-from service.protocol import samples as wire
-from service.protocol.container import decode_body, encode_body, split_state
-from service.protocol.errors import FieldError
-from service.protocol.keys import Keys, check_name
-from service.protocol.model import decode_model, encode_model
-from service.protocol.query import Answer, decode_query, decode_reply, encode_query, encode_reply
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.protocol import query as wire_flags
+from dehyst.service.protocol import query as wire_query
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.container import decode_body, encode_body, split_state
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import Keys, check_name
+from dehyst.service.protocol.model import decode_model, encode_model
+from dehyst.service.protocol.query import Answer, decode_query, decode_reply, encode_query, encode_reply
 
 # --- Payloads: what is encoded comes back, and nothing malformed gets through.
 

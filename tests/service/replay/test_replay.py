@@ -14,29 +14,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from lab.cli import main
-from service.answers.guard import Limits
-from service.config.learner import read_learner_settings
-from service.config.settings import AxisConfig
-from service.protocol.samples import SampleBatch
-from service.replay import Replayed, covered, replay, sequence, summary, write_gates
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.storage.model_file import BundleMeta, read_bundle, write_bundle
-from service.storage.recorder import Recorder, RecorderConfig
-from sim.recordings import Recording, read
-from sim.signals.voltages import multitone, training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.common import Domain
+from dehyst.baselines.linear import LinearInverse, LinearParameters
+from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.lab.cli import main
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.learner import read_learner_settings
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.replay import Replayed, covered, replay, sequence, summary, write_gates
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
+from dehyst.sim.recordings import Recording, read
+from dehyst.sim.signals.voltages import multitone, training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))

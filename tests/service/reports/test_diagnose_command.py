@@ -15,24 +15,24 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from adaptive.types import FloatArray
-from lab.cli import main
-from service.reports.diagnosis import write_report
-from service.reports.diagnosis_page import Source, best_known_number, length, spaced, with_unit
-from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.result import NamedCause, picture
-from sim.effects import CAUSES, Chain, effect, simulate
-from sim.fitting.fit_data import FitData
-from sim.pictures import MEASURED, WITH, WITHOUT, envelope
-from sim.stage.file import load_stage, save_stage
-from sim.stage.stage import Stage
+from dehyst.adaptive.types import FloatArray
+from dehyst.lab.cli import main
+from dehyst.service.reports.diagnosis import write_report
+from dehyst.service.reports.diagnosis_page import Source, best_known_number, length, spaced, with_unit
+from dehyst.sim.diagnosis.diagnose import Options, diagnose
+from dehyst.sim.diagnosis.result import NamedCause, picture
+from dehyst.sim.effects import CAUSES, Chain, effect, simulate
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.pictures import MEASURED, WITH, WITHOUT, envelope
+from dehyst.sim.stage.file import load_stage, save_stage
+from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
 
 
 def dehyst(*args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "lab.cli", *args], capture_output=True, text=True, timeout=170, check=False
+        [sys.executable, "-m", "dehyst.lab.cli", *args], capture_output=True, text=True, timeout=170, check=False
     )
 
 

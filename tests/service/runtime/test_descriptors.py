@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from service.cli.main import Command, main
-from service.client.client import Client
-from service.protocol.errors import FieldError
-from service.runtime.descriptors import need_descriptors, too_few
-from service.runtime.memory import in_use
-from service.runtime.session import open_client
+from dehyst.service.cli.main import Command, main
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.runtime.descriptors import need_descriptors, too_few
+from dehyst.service.runtime.memory import in_use
+from dehyst.service.runtime.session import open_client
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, eventually
 
@@ -67,7 +67,7 @@ def run(_: Any) -> int:
 def limited_to(number: int, *command: str) -> subprocess.CompletedProcess[str]:
     script = f'ulimit -n {number} && exec "$@"'
     return subprocess.run(
-        ["sh", "-c", script, "sh", sys.executable, "-m", "lab.cli", *command],
+        ["sh", "-c", script, "sh", sys.executable, "-m", "dehyst.lab.cli", *command],
         capture_output=True,
         text=True,
         timeout=60,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.runtime.logging_setup import set_up_logging
+from dehyst.service.runtime.logging_setup import set_up_logging
 
 log = logging.getLogger("dehyst.test")
 

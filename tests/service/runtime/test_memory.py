@@ -9,14 +9,14 @@ import sys
 
 import pytest
 
-from service.runtime.memory import in_use, starting
+from dehyst.service.runtime.memory import in_use, starting
 
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
 
 _CODE = """
 import sys, threading
 import numpy as np, psutil
-from service.runtime.memory import give_back, keep_little
+from dehyst.service.runtime.memory import give_back, keep_little
 little = sys.argv[1] == "little"
 if little:
     assert keep_little()
@@ -48,7 +48,7 @@ def test_many_threads_and_large_blocks_leave_nothing_behind() -> None:
 
 _IN_USE = """
 import numpy as np
-from service.runtime.memory import in_use
+from dehyst.service.runtime.memory import in_use
 before = in_use()
 large, small, objects = np.ones(2_000_000), [np.ones(1000) for _ in range(1000)], [[] for _ in range(10_000)]
 while_held = in_use()

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from lab.testbed import processes
-from lab.testbed.processes import Child, Children
-from service.runtime.stopping import StopSignal, unbroken
+from dehyst.lab.testbed import processes
+from dehyst.lab.testbed.processes import Child, Children
+from dehyst.service.runtime.stopping import StopSignal, unbroken
 
 SLEEPER = ["-c", "import time; print('up', flush=True); time.sleep(60)"]
 

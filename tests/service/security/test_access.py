@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 import zenoh
 
-from adaptive.errors import InputError
-from service.client.client import Client
-from service.operating.remote import operate
-from service.protocol import samples as wire
-from service.protocol.errors import NoReplyError, SessionError
-from service.protocol.keys import Keys
-from service.runtime.session import open_client
-from service.security.access import (
+from dehyst.adaptive.errors import InputError
+from dehyst.service.client.client import Client
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import NoReplyError, SessionError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_client
+from dehyst.service.security.access import (
     ROLES,
     Plan,
     access_control,
@@ -34,7 +34,7 @@ from service.security.access import (
     read_plan,
     remove,
 )
-from service.security.refusals import Refusals
+from dehyst.service.security.refusals import Refusals
 from tests.service.conftest import ServeProcess, unused_port, write_config
 
 USERS = {
@@ -322,7 +322,7 @@ def test_serving_and_routing_openly_is_refused_in_words(tmp_path: Path) -> None:
     config.write_text(config.read_text().replace("tcp/127.0.0.1:1", "tcp/0.0.0.0:1"))
     for args in (("serve", "--config", str(config)), ("router", "--listen", "tcp/0.0.0.0:1")):
         done = subprocess.run(
-            [sys.executable, "-m", "lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
+            [sys.executable, "-m", "dehyst.lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
         )
         assert done.returncode == 2
         assert "--insecure-beyond-loopback" in done.stderr

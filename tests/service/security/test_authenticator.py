@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from adaptive.errors import InputError
-from service.config.settings import ServeConfig
-from service.security.authenticator import (
+from dehyst.adaptive.errors import InputError
+from dehyst.service.config.settings import ServeConfig
+from dehyst.service.security.authenticator import (
     NO_KEY,
     STAMP,
     TAG,
@@ -23,7 +23,7 @@ from service.security.authenticator import (
     own_authenticator,
     read_key,
 )
-from service.server.process import authenticator_of
+from dehyst.service.server.process import authenticator_of
 
 KEY = b"0123456789abcdef"
 OURS, THEIRS = Authenticator(KEY), Authenticator(b"a stranger's own one")

@@ -19,15 +19,15 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.errors import CommandHeldError
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client, open_service, wait_followed
-from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
-from service.security.lease import CommandGate, CommandLease
-from service.security.tokens import Holder
-from service.stage_node.node import status_key
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import CommandHeldError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client, open_service, wait_followed
+from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_authenticator
+from dehyst.service.security.lease import CommandGate, CommandLease
+from dehyst.service.security.tokens import Holder
+from dehyst.service.stage_node.node import status_key
 from tests.service.living import eventually
 
 pytestmark = pytest.mark.e2e
@@ -37,9 +37,9 @@ KEYS = Keys("demo", "x")
 #: A controller that commands a voltage for the 200 samples after the newest, again and again.
 CONTROLLER = """
 import json, sys, time
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.errors import CommandHeldError
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import CommandHeldError
 newest = [-1]
 with Client.connect(sys.argv[1], timeout_s=5.0, wait_s=10.0) as client:
     client._session.declare_subscriber(
@@ -62,7 +62,17 @@ class Stage:
     """A stage that runs free beside the service, what it applied, and what it says."""
 
     def __init__(self, endpoint: str) -> None:
-        command = [sys.executable, "-m", "lab.cli", "stage", "--endpoint", endpoint, "--free-run", "--batch", "5"]
+        command = [
+            sys.executable,
+            "-m",
+            "dehyst.lab.cli",
+            "stage",
+            "--endpoint",
+            endpoint,
+            "--free-run",
+            "--batch",
+            "5",
+        ]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         assert self.process.stdout.readline().startswith("ready")

@@ -19,18 +19,18 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.client.client import Client
-from service.config.settings import read_config
-from service.operating.remote import operate
-from service.protocol.delta import FollowedState, encode_delta
-from service.protocol.errors import NoReplyError
-from service.protocol.keys import Keys
-from service.protocol.model import encode_model, model_parts
-from service.protocol.query import Answer, encode_query, encode_reply
-from service.protocol.samples import encode_samples
-from service.runtime.session import SURELY, open_client
-from service.security.authenticator import EVERYBODY, own_authenticator
-from service.server.process import Service
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import read_config
+from dehyst.service.operating.remote import operate
+from dehyst.service.protocol.delta import FollowedState, encode_delta
+from dehyst.service.protocol.errors import NoReplyError
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.model import encode_model, model_parts
+from dehyst.service.protocol.query import Answer, encode_query, encode_reply
+from dehyst.service.protocol.samples import encode_samples
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.security.authenticator import EVERYBODY, own_authenticator
+from dehyst.service.server.process import Service
 from tests.service.conftest import make_models, unused_port, write_config
 from tests.service.living import eventually
 

@@ -16,20 +16,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import Feedforward, FloatArray, InverseModel, Sample
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.intake.sequence import RESTART_AFTER
-from service.protocol.keys import Keys
-from service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
-from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
-from service.server.axis import Axis, EventLimiter, EventLog
-from service.server.axis_loading import load_axis, make_learner
-from service.server.axis_loop import AxisLoop
-from service.server.query_answers import LatencyMeter
-from service.server.status import axis_status
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel, Sample
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.intake.sequence import RESTART_AFTER
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
+from dehyst.service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
+from dehyst.service.server.axis import Axis, EventLimiter, EventLog
+from dehyst.service.server.axis_loading import load_axis, make_learner
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.query_answers import LatencyMeter
+from dehyst.service.server.status import axis_status
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.axes import loop_of
 
@@ -454,6 +454,6 @@ def test_a_flood_keeps_the_newest() -> None:
 
 
 def test_a_program_without_logging_stays_quiet() -> None:
-    program = "from service.server.axis import EventLog; EventLog('demo', 'x').note(1, 'learner_failed', 'no')"
+    program = "from dehyst.service.server.axis import EventLog; EventLog('demo', 'x').note(1, 'learner_failed', 'no')"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

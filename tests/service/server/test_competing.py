@@ -14,25 +14,32 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.tuning.config import RetuneConfig
-from adaptive.types import FloatArray, Hyperparameters, InverseModel
-from baselines import fit_linear, fit_mpi
-from service.answers.guard import Limits
-from service.background.retuner import ADOPTIONS_FILE, Adoptions, Retuned, Retuner, append_adoption, read_adoptions
-from service.background.retuning_worker import start_job
-from service.background.settings import RetuningConfig
-from service.config.settings import AxisConfig, parse_config
-from service.protocol.errors import FieldError
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis
-from service.server.learner_supervisor import champion_of
-from service.storage.model_file import Bundle, BundleMeta
-from sim.signals.voltages import training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.tuning.config import RetuneConfig
+from dehyst.adaptive.types import FloatArray, Hyperparameters, InverseModel
+from dehyst.baselines import fit_linear, fit_mpi
+from dehyst.service.answers.guard import Limits
+from dehyst.service.background.retuner import (
+    ADOPTIONS_FILE,
+    Adoptions,
+    Retuned,
+    Retuner,
+    append_adoption,
+    read_adoptions,
+)
+from dehyst.service.background.retuning_worker import start_job
+from dehyst.service.background.settings import RetuningConfig
+from dehyst.service.config.settings import AxisConfig, parse_config
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.server.learner_supervisor import champion_of
+from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.online_models import PlainModel
 
 DT_S = 1e-3
@@ -53,7 +60,7 @@ def recorded() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def bundle(recorded: tuple[np.ndarray, np.ndarray]) -> Bundle:
-    from adaptive.identification import IdentifyConfig, identify_lssvm
+    from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 
     u_V, y_um = (column[:6000] for column in recorded)
     found: dict[str, InverseModel] = {
@@ -281,7 +288,7 @@ def test_a_bad_proposal_is_found_out_by_its_trial(
     def job(order: dict[str, Any], *rest: Any) -> Any:
         return Misled() if order["kind"] == "propose" else start_job(order, *rest)
 
-    monkeypatch.setattr("service.background.retuner.start_job", job)
+    monkeypatch.setattr("dehyst.service.background.retuner.start_job", job)
     axis = tunable(bundle)
     before = hyper_of(axis)
     events = [event["event"] for event in retuned_from_7700(axis, recorded, retuner)]
@@ -333,7 +340,7 @@ def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Told(PROPOSED, OPEN, OPEN, OPEN)
-    monkeypatch.setattr("service.background.retuner.start_job", told)
+    monkeypatch.setattr("dehyst.service.background.retuner.start_job", told)
     axis = tunable(bundle)
     give(axis, recorded, 6000, 8000, retuner)
     retuner.request({})
@@ -396,9 +403,10 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
         "sys.meta_path.insert(0, Blocked())\n"
-        "import service.server.axis_server, service.server.axis_loading, service.background.retuner\n"
-        "from service.background.retuning_worker import _search\n"
-        "assert 'baselines.swarm.evidence_search' not in sys.modules\n"
+        "import dehyst.service.server.axis_server, dehyst.service.server.axis_loading\n"
+        "import dehyst.service.background.retuner\n"
+        "from dehyst.service.background.retuning_worker import _search\n"
+        "assert 'dehyst.baselines.swarm.evidence_search' not in sys.modules\n"
         "print(_search(True)[1])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.types import InverseModel
-from service.answers.guard import Limits
-from service.client.follower import Follower
-from service.config.settings import AxisConfig
-from service.protocol.delta import FollowedState, decode_delta
-from service.protocol.model import check_model
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.security.access import access_control
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis, make_learner
-from service.server.deltas import DeltaStreams
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.follower import Follower
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.protocol.delta import FollowedState, decode_delta
+from dehyst.service.protocol.model import check_model
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.security.access import access_control
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis, make_learner
+from dehyst.service.server.deltas import DeltaStreams
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 
 DT_S = 1e-3
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
 from benchmarks.forged_states import DT_S, make_axis, recording
-from service.protocol.model import fingerprint
-from service.protocol.query import FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.protocol.query import FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 LEARNT, STEP = 1500, 20
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from service.answers.guard import Limits
-from service.client.client import Client
-from service.config.settings import AxisConfig
-from service.identification.identifying import motion_of
-from service.protocol.samples import SampleBatch
-from service.server.axis_loading import load_axis
-from service.storage.model_file import BundleMeta, write_bundle
-from sim.recordings import Recording
-from sim.signals.voltages import multitone, training_input
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
+from dehyst.service.answers.guard import Limits
+from dehyst.service.client.client import Client
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.identification.identifying import motion_of
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from dehyst.sim.recordings import Recording
+from dehyst.sim.signals.voltages import multitone, training_input
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 from tests.service.conftest import ServeProcess
 
 DT_S, A_MESSAGE = 1e-3, 20

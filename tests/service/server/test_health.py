@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.types import InverseModel
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.intake.sample_queue import Arrived
-from service.protocol.keys import Keys
-from service.protocol.samples import SampleBatch
-from service.server.axis_loading import load_axis, make_learner
-from service.server.axis_loop import AxisLoop
-from service.server.health import Health, Staleness
-from service.server.query_answers import LatencyMeter
-from service.server.status import axis_status
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.intake.sample_queue import Arrived
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis_loading import load_axis, make_learner
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.health import Health, Staleness
+from dehyst.service.server.query_answers import LatencyMeter
+from dehyst.service.server.status import axis_status
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.service.axes import loop_of
 
 DT_S = 1e-3
@@ -81,9 +81,9 @@ def test_received_is_what_was_learnt_refused_thinned_and_dropped(
 ) -> None:
     loop = axis_loop(META, queue_samples=300)
     sent = 0
-    monkeypatch.setattr("service.intake.sample_queue.MOST_TOGETHER", 50)
+    monkeypatch.setattr("dehyst.service.intake.sample_queue.MOST_TOGETHER", 50)
     now_s = iter(0.1 * k for k in range(10_000))
-    monkeypatch.setattr("service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
+    monkeypatch.setattr("dehyst.service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
     for number, batch in enumerate(batches(seed, 4000)):
         # The stage is faster than the learner, which takes some samples now and then.
         loop.offer(batch)
@@ -110,9 +110,9 @@ def test_numbers_handled_add_up_at_every_moment_while_samples_are_left_out(
 ) -> None:
     """What is left out counts at once, its numbers are passed when those before it have been handled."""
     loop = axis_loop(META, queue_samples=300)
-    monkeypatch.setattr("service.intake.sample_queue.MOST_TOGETHER", 50)
+    monkeypatch.setattr("dehyst.service.intake.sample_queue.MOST_TOGETHER", 50)
     now_s = iter(0.1 * k for k in range(10_000))
-    monkeypatch.setattr("service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
+    monkeypatch.setattr("dehyst.service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
     rng = np.random.default_rng(0)
     seq = np.arange(4000)
     # The network loses some, of which no notice must be lost either.

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.answers.slices import Pace
-from service.protocol.errors import BusyError, ServiceError
-from service.server.long_queries import LongQueries
+from dehyst.service.answers.slices import Pace
+from dehyst.service.protocol.errors import BusyError, ServiceError
+from dehyst.service.server.long_queries import LongQueries
 
 SLICE = 100
 SLICE_S = 0.002

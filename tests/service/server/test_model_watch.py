@@ -13,21 +13,21 @@ import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from adaptive.inverse_model import LssvmInverse
-from adaptive.online.gates import DUPLICATE, GAP, LEARNT, OUT_OF_ORDER, UNTRUSTED
-from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
-from service.answers.guard import Limits
-from service.answers.which_model import NOTHING_LEARNT
-from service.config.settings import AxisConfig
-from service.intake.sequence import AHEAD
-from service.protocol.model import fingerprint
-from service.protocol.query import STAND_IN, FeedforwardQuery
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_supervisor import UNUSABLE, SampleWatch
-from service.storage.model_file import Bundle, BundleMeta
+from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.gates import DUPLICATE, GAP, LEARNT, OUT_OF_ORDER, UNTRUSTED
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.which_model import NOTHING_LEARNT
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.intake.sequence import AHEAD
+from dehyst.service.protocol.model import fingerprint
+from dehyst.service.protocol.query import STAND_IN, FeedforwardQuery
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis, make_learner
+from dehyst.service.server.learner_supervisor import UNUSABLE, SampleWatch
+from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import SmoothingLearner
 from tests.service.conftest import DT_S, make_models
 

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 import zenoh
 
-from adaptive.types import InverseModel
-from service.client.client import Client
-from service.protocol import samples as wire
-from service.protocol.errors import NoReplyError
-from service.protocol.query import encode_query
-from service.runtime.session import open_client
-from service.storage.model_file import BundleMeta, write_bundle
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.client.client import Client
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.errors import NoReplyError
+from dehyst.service.protocol.query import encode_query
+from dehyst.service.runtime.session import open_client
+from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import write_config
 
 pytestmark = pytest.mark.e2e
@@ -31,7 +31,7 @@ DT_S = 1e-3
 
 def dehyst(*args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "dehyst.lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
     )
 
 
@@ -186,8 +186,8 @@ def test_the_example_is_printed_and_help_names_units() -> None:
 
 def test_the_serving_process_imports_no_torch_and_no_plots() -> None:
     code = (
-        "import sys, service.server.process, service.cli.commands.serve, service.storage.recorder;"
-        "import adaptive.online.learner;"
+        "import sys, dehyst.service.server.process, dehyst.service.cli.commands.serve, dehyst.service.storage.recorder;"
+        "import dehyst.adaptive.online.learner;"
         "print([m for m in ('torch', 'matplotlib', 'rerun') if m in sys.modules])"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
@@ -198,7 +198,7 @@ def test_a_stop_waits_for_zenohs_callback_threads(tmp_path: Path, free_port: int
     """A daemon among them that returns while the interpreter ends aborts the process after a clean stop."""
     code = (
         "import sys, threading; from pathlib import Path;"
-        "from service.config.settings import read_config; from service.server.process import Service\n"
+        "from dehyst.service.config.settings import read_config; from dehyst.service.server.process import Service\n"
         "with Service(read_config(Path(sys.argv[1]))):\n"
         "    print([t.daemon for t in threading.enumerate() if 'pyo3' in t.name])"
     )

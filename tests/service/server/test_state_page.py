@@ -6,12 +6,12 @@ import re
 from pathlib import Path
 
 from benchmarks.forged_states import make_axis, recording
-from service.server.state_page import page
+from dehyst.service.server.state_page import page
 
 
 def test_the_page_is_up_to_date() -> None:
     committed = (Path(__file__).resolve().parents[3] / "docs" / "state.md").read_text(encoding="utf-8")
-    assert committed == page(), "run: python -m service.server.state_page > docs/state.md"
+    assert committed == page(), "run: python -m dehyst.service.server.state_page > docs/state.md"
 
 
 def test_the_entries_of_a_record_are_listed_once() -> None:

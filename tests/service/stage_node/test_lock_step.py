@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from lab.testbed.identified_stage import Rig
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client, wait_followed
-from service.stage_node.exchange import CommandBuffer
-from service.stage_node.node import NodeConfig
-from sim.stage.presets import preset
+from dehyst.adaptive.errors import InputError
+from dehyst.lab.testbed.identified_stage import Rig
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client, wait_followed
+from dehyst.service.stage_node.exchange import CommandBuffer
+from dehyst.service.stage_node.node import NodeConfig
+from dehyst.sim.stage.presets import preset
 
 PAUSE_S = 0.4
 

@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from service.cli.commands.stage import parse_change
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.runtime.session import SURELY, open_client
-from service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
-from service.stage_node.faults import fault_key
-from service.stage_node.node import NodeConfig, status_key
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.commands.stage import parse_change
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
+from dehyst.service.stage_node.faults import fault_key
+from dehyst.service.stage_node.node import NodeConfig, status_key
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -39,7 +39,7 @@ def free_endpoint() -> str:
 @contextmanager
 def stage_process(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
-    command = [sys.executable, "-m", "lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
+    command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -230,7 +230,7 @@ def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told
 def test_bad_options_get_a_message_and_status_2(
     options: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from lab.cli import main
+    from dehyst.lab.cli import main
 
     assert main(["stage", *options]) == 2
     assert message in capsys.readouterr().err
@@ -241,7 +241,7 @@ def test_a_port_in_use_is_said() -> None:
         holder.bind(("127.0.0.1", 0))
         holder.listen()
         endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
-        command = [sys.executable, "-m", "lab.cli", "stage", "--listen", endpoint]
+        command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert "in use" in done.stderr
@@ -280,8 +280,8 @@ def test_bad_node_configuration() -> None:
 def test_stage_file_and_options_make_the_configuration(tmp_path: Path) -> None:
     import argparse
 
-    from service.cli.commands.stage import add_arguments, stage_config
-    from sim.stage.file import save_stage
+    from dehyst.service.cli.commands.stage import add_arguments, stage_config
+    from dehyst.sim.stage.file import save_stage
 
     path = tmp_path / "stage.toml"
     save_stage(preset("bouc_wen", seed=3), path)
@@ -327,9 +327,10 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
 def test_a_simulated_stage_loads_no_diagnosis_and_no_large_part_of_scipy() -> None:
     """The files of effects hold their forms and direct tests as well; a stage must not wait for what those call."""
     code = (
-        "import sys; import service.stage_node.node, sim.stage.presets; "
+        "import sys; import dehyst.service.stage_node.node, dehyst.sim.stage.presets; "
         "heavy = [f'scipy.{part}' for part in ('optimize', 'stats', 'signal', 'interpolate')]; "
-        "found = {*heavy, 'sim.diagnosis', 'sim.recordings', 'sim.readings.readings'} & sys.modules.keys(); "
+        "heavy += [f'dehyst.sim.{part}' for part in ('diagnosis', 'recordings', 'readings.readings')]; "
+        "found = set(heavy) & sys.modules.keys(); "
         "assert not found, found"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

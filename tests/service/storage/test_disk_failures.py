@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from service.cli.main import main
-from service.client.client import Client
-from service.operating.metrics import page
-from service.server.health import NOT_KEPT, NOT_RECORDED, DiskFailures, Health
+from dehyst.service.cli.main import main
+from dehyst.service.client.client import Client
+from dehyst.service.operating.metrics import page
+from dehyst.service.server.health import NOT_KEPT, NOT_RECORDED, DiskFailures, Health
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually
 

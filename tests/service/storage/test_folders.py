@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.intake.sample_queue import SampleQueue
-from service.protocol.errors import FieldError
-from service.server.axis_loading import load_axis
-from service.storage import checkpoint
-from service.storage.checkpoint import CheckpointKeeper
-from service.storage.model_file import BundleMeta, read_bundle, write_bundle
-from service.storage.output import atomic_write
-from service.storage.recorder import Recorder, RecorderConfig
-from service.storage.segments import rows_behind
-from sim.recordings import read
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.intake.sample_queue import SampleQueue
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.server.axis_loading import load_axis
+from dehyst.service.storage import checkpoint
+from dehyst.service.storage.checkpoint import CheckpointKeeper
+from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
+from dehyst.service.storage.output import atomic_write
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
+from dehyst.service.storage.segments import rows_behind
+from dehyst.sim.recordings import read
 from tests.service.axes import loop_of
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import ModelFileError
 from benchmarks.forged_states import DT_S, Victims, make_axis, recording
-from service.protocol.samples import SampleBatch
-from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
+from dehyst.adaptive.errors import ModelFileError
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 COUNT = 400
 

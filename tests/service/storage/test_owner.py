@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.client.client import Client
-from service.protocol.errors import FieldError
-from service.storage.owner import FolderOwnedError, FolderOwner, owner_of
-from service.storage.recorder import Recorder, RecorderConfig
-from service.storage.segments import LOCK, rows_behind, segments
+from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.storage.owner import FolderOwnedError, FolderOwner, owner_of
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
+from dehyst.service.storage.segments import LOCK, rows_behind, segments
 from tests.service.conftest import DT_S, unused_port, write_config
 from tests.service.living import Process, Stage, eventually
 
 HOLDS = """
 import sys, time
 from pathlib import Path
-from service.storage.owner import FolderOwner
+from dehyst.service.storage.owner import FolderOwner
 FolderOwner(Path(sys.argv[1]), ".lock", sys.argv[2]).take()
 print("held", flush=True)
 time.sleep(60)
@@ -81,7 +81,7 @@ def test_a_second_service_with_the_folder_of_the_first_is_refused(tmp_path: Path
 
     def refused(config: Path) -> str:
         done = subprocess.run(
-            [sys.executable, "-m", "lab.cli", "serve", "--config", str(config)],
+            [sys.executable, "-m", "dehyst.lab.cli", "serve", "--config", str(config)],
             capture_output=True,
             text=True,
             timeout=60,

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from service.storage import segments as recorder_files
-from service.storage.recorder import ASIDE, Recorder, RecorderConfig
-from service.storage.segments import Journal, Rows, read_journal, segments
-from sim.recordings import check, read
+from dehyst.adaptive.errors import InputError
+from dehyst.service.storage import segments as recorder_files
+from dehyst.service.storage.recorder import ASIDE, Recorder, RecorderConfig
+from dehyst.service.storage.segments import Journal, Rows, read_journal, segments
+from dehyst.sim.recordings import check, read
 from tests.service.axes import loop_of
 from tests.service.storage.test_stored_files import make_axis
 from tests.service.storage.test_stored_files import recording as arriving
@@ -251,7 +251,7 @@ def test_a_killed_process_leaves_a_stream_that_the_next_run_closes(tmp_path: Pat
     program = (
         "import sys, time, numpy as np\n"
         "from pathlib import Path\n"
-        "from service.storage.recorder import Recorder, RecorderConfig\n"
+        "from dehyst.service.storage.recorder import Recorder, RecorderConfig\n"
         "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.02))\n"
         "for k in range(1000):\n"
         "    seq = np.arange(10 * k, 10 * k + 10)\n"
@@ -323,7 +323,7 @@ def test_a_file_size_limit_is_a_full_disk(tmp_path: Path) -> None:
     program = (
         "import resource, sys, time, numpy as np\n"
         "from pathlib import Path\n"
-        "from service.storage.recorder import Recorder, RecorderConfig\n"
+        "from dehyst.service.storage.recorder import Recorder, RecorderConfig\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (50_001, resource.RLIM_INFINITY))\n"
         "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.005, retry_s=0.05))\n"
         "k = 0\n"

@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.types import InverseModel
-from service.answers.guard import Limits
-from service.config.settings import AxisConfig
-from service.intake.sample_queue import SampleQueue
-from service.operating.verbs import Request, Verbs
-from service.protocol.model import digests, fingerprint
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
-from service.server.axis_loading import load_axis, make_learner
-from service.server.axis_loop import AxisLoop
-from service.storage import checkpoint
-from service.storage import model_file as modelfile
-from service.storage.checkpoint import (
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.types import InverseModel
+from dehyst.service.answers.guard import Limits
+from dehyst.service.config.settings import AxisConfig
+from dehyst.service.intake.sample_queue import SampleQueue
+from dehyst.service.operating.verbs import Request, Verbs
+from dehyst.service.protocol.model import digests, fingerprint
+from dehyst.service.protocol.samples import SampleBatch
+from dehyst.service.server.axis import Axis
+from dehyst.service.server.axis_loading import load_axis, make_learner
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.storage import checkpoint
+from dehyst.service.storage import model_file as modelfile
+from dehyst.service.storage.checkpoint import (
     LISTED_S,
     CheckpointFolder,
     CheckpointKeeper,
@@ -38,8 +38,8 @@ from service.storage.checkpoint import (
     is_kept,
     restore_newest,
 )
-from service.storage.model_file import UNITS, Bundle, BundleMeta, read_bundle, write_bundle
-from service.storage.output import atomic_write
+from dehyst.service.storage.model_file import UNITS, Bundle, BundleMeta, read_bundle, write_bundle
+from dehyst.service.storage.output import atomic_write
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually
 

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from service.cli.commands.view import twins
-from service.protocol import samples as wire
-from service.protocol.keys import Keys
-from service.runtime.session import open_service
-from service.security.authenticator import own_authenticator
-from service.viewer.consumer import Consumer, ConsumerConfig
-from service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking, event_record
+from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.commands.view import twins
+from dehyst.service.protocol import samples as wire
+from dehyst.service.protocol.keys import Keys
+from dehyst.service.runtime.session import open_service
+from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.viewer.consumer import Consumer, ConsumerConfig
+from dehyst.service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking, event_record
 
 DT_S = 1e-3
 BATCH = 20
@@ -187,7 +187,7 @@ def test_the_process_writes_a_recording_that_reads_back(tmp_path: Path) -> None:
     endpoint, path = free_endpoint(), tmp_path / "live.rrd"
     with open_service([endpoint]) as session:
         command = [
-            sys.executable, "-m", "lab.cli", "view", "--endpoint", endpoint, "--stage", "demo", "--axis", "x",
+            sys.executable, "-m", "dehyst.lab.cli", "view", "--endpoint", endpoint, "--stage", "demo", "--axis", "x",
             "--twin", "x_linear=linear", "--rrd", str(path), "--range-um", "60", "--json",
         ]  # fmt: skip
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -256,11 +256,11 @@ def read_back(path: Path) -> tuple[dict[str, Any], list[str], int]:
     ],
 )
 def test_what_cannot_be_done_is_said_and_ends_with_a_status(tmp_path: Path, options: list[str], words: str) -> None:
-    from lab.cli import main
+    from dehyst.lab.cli import main
 
     house = Path(main.__code__.co_filename).parents[1]
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", "view", *options],
+        [sys.executable, "-m", "dehyst.lab.cli", "view", *options],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -13,14 +13,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.viewer import style
-from service.viewer.consumer import ReferenceRing, SampleReferenceJoin
-from service.viewer.layout import HEIGHT, WIDTH, Box, Part, Plane, PlaneView, Plot, TextView, grown, layout, ticks
-from service.viewer.records import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
-from service.viewer.rerun_sink import cut, in_order
-from service.viewer.scene import Scene
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.viewer import style
+from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
+from dehyst.service.viewer.layout import (
+    HEIGHT,
+    WIDTH,
+    Box,
+    Part,
+    Plane,
+    PlaneView,
+    Plot,
+    TextView,
+    grown,
+    layout,
+    ticks,
+)
+from dehyst.service.viewer.records import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
+from dehyst.service.viewer.rerun_sink import cut, in_order
+from dehyst.service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")
 

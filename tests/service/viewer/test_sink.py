@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from service.viewer.output import Output, OutputConfig
-from service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
-from service.viewer.rerun_sink import write_recording
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.service.viewer.output import Output, OutputConfig
+from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
+from dehyst.service.viewer.rerun_sink import write_recording
 from tests.service.conftest import unused_port
 
 MODELS = ("lssvm_adaptive", "linear")
@@ -191,7 +191,7 @@ def test_a_viewer_that_does_not_answer_ends_within_its_time() -> None:
 
 
 def test_a_spawned_viewer_is_there_and_bound_to_this_machine() -> None:
-    from service.viewer.rerun_sink import viewer_command
+    from dehyst.service.viewer.rerun_sink import viewer_command
 
     command = viewer_command(9876)
     assert command[command.index("--bind") + 1] == "127.0.0.1"
@@ -200,7 +200,7 @@ def test_a_spawned_viewer_is_there_and_bound_to_this_machine() -> None:
 
 
 def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:
-    from service.viewer.rerun_sink import page_of, spawn_viewer, viewer_command
+    from dehyst.service.viewer.rerun_sink import page_of, spawn_viewer, viewer_command
 
     port, web_port = unused_port(), unused_port()
     command = viewer_command(port, web_port=web_port)
@@ -227,8 +227,8 @@ def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:
 KILLED = """
 import os, signal, struct, sys
 from pathlib import Path
-from service.viewer.output import Output, OutputConfig
-from service.viewer.records import SceneConfig
+from dehyst.service.viewer.output import Output, OutputConfig
+from dehyst.service.viewer.records import SceneConfig
 if __name__ == "__main__":
     output = Output(OutputConfig(SceneConfig("demo/x", ("linear",)), rrd=Path(sys.argv[1])))
     print(output.pid, flush=True)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from baselines import fit_bouc_wen
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.common import Domain
-from sim.chapter import published
-from sim.chapter.control import (
+from dehyst.adaptive.errors import InputError
+from dehyst.baselines import fit_bouc_wen
+from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
+from dehyst.baselines.common import Domain
+from dehyst.sim.chapter import published
+from dehyst.sim.chapter.control import (
     BlockConfig,
     changing,
     chapter_reference,
@@ -29,13 +29,13 @@ from sim.chapter.control import (
     track_learning,
     training_reference,
 )
-from sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width
-from sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs, posterior_mean
-from sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
-from sim.signals.voltages import training_input
-from sim.stage.closed_loop import track
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width
+from dehyst.sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs, posterior_mean
+from dehyst.sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
+from dehyst.sim.signals.voltages import training_input
+from dehyst.sim.stage.closed_loop import track
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 # --- The chapter's experiments and forward models on the simulated stages.
 
@@ -213,7 +213,7 @@ def test_blocks_of_a_model_that_does_not_learn_equal_one_run() -> None:
     """A learner that is never due to learn serves its base: blocks and carried memory must not change a voltage."""
     stage, reference = Stage(preset("bouc_wen")), sine_reference(70.0, duration_s=1.0)
     model = inverse()
-    from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
+    from dehyst.baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 
     online = BoucWenOnline(model, TrackingConfig(learn_every=10**6))
     blocks = track_learning(stage, reference, online, config=BlockConfig(block=7, delay_blocks=2))

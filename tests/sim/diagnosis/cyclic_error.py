@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.types import FloatArray
-from sim import pictures
-from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel, Guess
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim import pictures
+from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, Guess
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
 
 # Its step in the simulation.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.types import FloatArray
+from dehyst.adaptive.types import FloatArray
 
 
 def plays(u_V: FloatArray, radii_V: FloatArray) -> FloatArray:

@@ -8,20 +8,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from sim.diagnosis.catalogue import CATALOGUE
-from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.export import export_stage
-from sim.diagnosis.next_experiment import next_experiment
-from sim.diagnosis.nominal import calibrate_nominal, with_nominal_kind
-from sim.diagnosis.result import Diagnosis
-from sim.diagnosis.witnesses import witnesses
-from sim.effects import Chain, Effect, effect, simulate
-from sim.effects.sensor_lag import SensorLag
-from sim.fitting.calibration import evaluate
-from sim.fitting.fit_data import FitData
-from sim.readings.readings import Readings
-from sim.stage.file import from_dict, to_dict
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.catalogue import CATALOGUE
+from dehyst.sim.diagnosis.diagnose import Options, diagnose
+from dehyst.sim.diagnosis.export import export_stage
+from dehyst.sim.diagnosis.next_experiment import next_experiment
+from dehyst.sim.diagnosis.nominal import calibrate_nominal, with_nominal_kind
+from dehyst.sim.diagnosis.result import Diagnosis
+from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.effects import Chain, Effect, effect, simulate
+from dehyst.sim.effects.sensor_lag import SensorLag
+from dehyst.sim.fitting.calibration import evaluate
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.stage.file import from_dict, to_dict
 
 DT = 1e-3
 

@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
-from sim.diagnosis.nominal import BoucWenStage, calibrate_nominal, with_nominal_kind
-from sim.diagnosis.search.search import first_fits
-from sim.effects.gain_drift import in_rests
-from sim.effects.hysteresis_shape import HysteresisShape
-from sim.effects.payload_change import seen as payload_seen
-from sim.effects.sampled_lags import lags_of_response, second_lag
-from sim.effects.saturation import Saturation
-from sim.effects.saturation import seen as saturation_seen
-from sim.effects.sensor_lag import SensorLag
-from sim.effects.slew_limit import seen as slew_seen
-from sim.effects.thermal_drift import in_rests as drift_in_rests
-from sim.effects.timing import Clock
-from sim.effects.timing import seen as timing_seen
-from sim.fitting.calibration import with_new_columns
-from sim.fitting.fit_data import FitData
-from sim.readings.cycles import mirrored_branches
-from sim.readings.noise import noise_floor
-from sim.readings.readings import Readings
-from sim.readings.ringing import Ringing, ringing
-from sim.readings.slow_motion import rests_over_time
+from dehyst.sim.diagnosis import Diagnosis, diagnose_prepared, prepare
+from dehyst.sim.diagnosis.nominal import BoucWenStage, calibrate_nominal, with_nominal_kind
+from dehyst.sim.diagnosis.search.search import first_fits
+from dehyst.sim.effects.gain_drift import in_rests
+from dehyst.sim.effects.hysteresis_shape import HysteresisShape
+from dehyst.sim.effects.payload_change import seen as payload_seen
+from dehyst.sim.effects.sampled_lags import lags_of_response, second_lag
+from dehyst.sim.effects.saturation import Saturation
+from dehyst.sim.effects.saturation import seen as saturation_seen
+from dehyst.sim.effects.sensor_lag import SensorLag
+from dehyst.sim.effects.slew_limit import seen as slew_seen
+from dehyst.sim.effects.thermal_drift import in_rests as drift_in_rests
+from dehyst.sim.effects.timing import Clock
+from dehyst.sim.effects.timing import seen as timing_seen
+from dehyst.sim.fitting.calibration import with_new_columns
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.readings.cycles import mirrored_branches
+from dehyst.sim.readings.noise import noise_floor
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.ringing import Ringing, ringing
+from dehyst.sim.readings.slow_motion import rests_over_time
 from tests.hidden.foreign.cases import healthy, pair, single
 from tests.hidden.foreign.record import Case, Rig
 from tests.hidden.foreign.score import nominal_of, recording_of

@@ -8,11 +8,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from sim.diagnosis.search.held_out import Split, held_out
-from sim.effects.hysteresis_shape import HysteresisShape
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import ModelFit, Signals, StageModel
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.search.held_out import Split, held_out
+from dehyst.sim.effects.hysteresis_shape import HysteresisShape
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import ModelFit, Signals, StageModel
 
 N = 2000
 PARTS = Split(np.arange(21) * 100, np.arange(20) % 4)

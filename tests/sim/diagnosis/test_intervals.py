@@ -9,9 +9,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.intervals import (
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.search.held_out import Split
+from dehyst.sim.diagnosis.search.intervals import (
     WIDER,
     ParameterErrors,
     across_zero,
@@ -19,11 +19,11 @@ from sim.diagnosis.search.intervals import (
     over_ties,
     parameter_errors,
 )
-from sim.diagnosis.search.search import Search, Thresholds
-from sim.effects.delay import Delay
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import CauseModel, ModelFit
-from sim.readings.readings import Readings
+from dehyst.sim.diagnosis.search.search import Search, Thresholds
+from dehyst.sim.effects.delay import Delay
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import CauseModel, ModelFit
+from dehyst.sim.readings.readings import Readings
 
 N = 2000
 PARTS = Split(np.arange(21) * 100, np.arange(20) % 4)

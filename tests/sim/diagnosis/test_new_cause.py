@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from service.reports.diagnosis_page import DIFFERENCES, Source, page
-from sim.diagnosis.catalogue import CATALOGUE
-from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.export import export_stage
-from sim.diagnosis.result import Diagnosis, picture
-from sim.effects import CAUSES, EFFECTS, simulate
-from sim.fitting.fit_data import FitData
-from sim.pictures import WITH, WITHOUT
+from dehyst.adaptive.errors import InputError
+from dehyst.service.reports.diagnosis_page import DIFFERENCES, Source, page
+from dehyst.sim.diagnosis.catalogue import CATALOGUE
+from dehyst.sim.diagnosis.diagnose import Options, diagnose
+from dehyst.sim.diagnosis.export import export_stage
+from dehyst.sim.diagnosis.result import Diagnosis, picture
+from dehyst.sim.effects import CAUSES, EFFECTS, simulate
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.pictures import WITH, WITHOUT
 from tests.sim.diagnosis.cyclic_error import CYCLIC_ERROR
 from tests.sim.diagnosis.test_diagnosis import DT, stage
 

@@ -10,32 +10,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.diagnosis.nominal import BoucWenStage
-from sim.diagnosis.prepare import prepare
-from sim.diagnosis.search.held_out import split
-from sim.diagnosis.search.screening import ScreenedCause, p_value
-from sim.effects import effect, simulate
-from sim.effects.hysteresis_shape import HysteresisShape
-from sim.effects.rate_dependence import RATE_DEPENDENCE, RateDependence
-from sim.effects.resonance import Resonance
-from sim.effects.stick_slip import StickSlip, friction, in_library
-from sim.effects.timing import resample
-from sim.fitting.calibration import DampingRule, calibrate, damped_step, free_indices
-from sim.fitting.dynamics import Dynamics, respond
-from sim.fitting.fit_data import ActsOn, FitData
-from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
-from sim.fitting.stage_model import StageModel
-from sim.readings.noise import (
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.nominal import BoucWenStage
+from dehyst.sim.diagnosis.prepare import prepare
+from dehyst.sim.diagnosis.search.held_out import split
+from dehyst.sim.diagnosis.search.screening import ScreenedCause, p_value
+from dehyst.sim.effects import effect, simulate
+from dehyst.sim.effects.hysteresis_shape import HysteresisShape
+from dehyst.sim.effects.rate_dependence import RATE_DEPENDENCE, RateDependence
+from dehyst.sim.effects.resonance import Resonance
+from dehyst.sim.effects.stick_slip import StickSlip, friction, in_library
+from dehyst.sim.effects.timing import resample
+from dehyst.sim.fitting.calibration import DampingRule, calibrate, damped_step, free_indices
+from dehyst.sim.fitting.dynamics import Dynamics, respond
+from dehyst.sim.fitting.fit_data import ActsOn, FitData
+from dehyst.sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
+from dehyst.sim.fitting.stage_model import StageModel
+from dehyst.sim.readings.noise import (
     converter_grid,
     has_spectral_line,
     noise_floor,
     repeated_period,
     repeated_readings,
 )
-from sim.readings.slow_motion import Change
-from sim.recordings import Recording
+from dehyst.sim.readings.slow_motion import Change
+from dehyst.sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 
 DT = 5e-4

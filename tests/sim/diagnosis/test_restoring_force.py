@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from baselines.bouc_wen.mechanical import MechanicalBoucWen
-from sim.diagnosis.diagnose import diagnose_prepared
-from sim.diagnosis.export import export_stage
-from sim.diagnosis.prepare import prepare
-from sim.effects import effect, simulate
-from sim.fitting.dynamics import Dynamics, ForceLoop, respond
-from sim.fitting.hysteresis_loops import plays_nested
-from sim.recordings import Recording
+from dehyst.adaptive.types import FloatArray
+from dehyst.baselines.bouc_wen.mechanical import MechanicalBoucWen
+from dehyst.sim.diagnosis.diagnose import diagnose_prepared
+from dehyst.sim.diagnosis.export import export_stage
+from dehyst.sim.diagnosis.prepare import prepare
+from dehyst.sim.effects import effect, simulate
+from dehyst.sim.fitting.dynamics import Dynamics, ForceLoop, respond
+from dehyst.sim.fitting.hysteresis_loops import plays_nested
+from dehyst.sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 
 DT = 1.0 / 750.0

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive.types import FloatArray
-from sim.diagnosis.diagnose import changing
-from sim.diagnosis.search.held_out import HeldOut, Split
-from sim.diagnosis.search.screening import ScreenedCause
-from sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
-from sim.diagnosis.search.stretches import sizes_by_stretch
-from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.stage_model import CauseModel, ModelFit
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.diagnose import changing
+from dehyst.sim.diagnosis.search.held_out import HeldOut, Split
+from dehyst.sim.diagnosis.search.screening import ScreenedCause
+from dehyst.sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
+from dehyst.sim.diagnosis.search.stretches import sizes_by_stretch
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, ModelFit
+from dehyst.sim.readings.sight import Sight
 
 #: Twelve stretches of two blocks of ten samples.
 PARTS = Split(np.arange(25) * 10, np.repeat(np.arange(12) % 4, 2))

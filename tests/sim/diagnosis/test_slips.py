@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from sim.effects.timing import (
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.effects.timing import (
     best_slip_move,
     date_slips,
     find_slips,
     merge_close_slips,
     without_small_slips,
 )
-from sim.readings.lateness import SlipList
+from dehyst.sim.readings.lateness import SlipList
 
 N = 6000
 NOISE_UM = 0.005

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
-from sim.diagnosis.diagnose import without_start
-from sim.diagnosis.witnesses import witnesses
-from sim.effects.mains_hum import MainsHum
-from sim.fitting.fit_data import FitData
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.diagnose import without_start
+from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.effects.mains_hum import MainsHum
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
 from tests.foreign.inject import inject
 
 DT, N = 0.005, 4000

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.diagnosis.diagnose import diagnose_prepared
-from sim.diagnosis.export import OFFSET, export_stage
-from sim.diagnosis.prepare import prepare
-from sim.diagnosis.result import TEST, Diagnosis
-from sim.effects import Chain, effect
-from sim.effects.timing import find_slips
-from sim.fitting.modes import peaks
-from sim.recordings import Recording, read
-from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.diagnose import diagnose_prepared
+from dehyst.sim.diagnosis.export import OFFSET, export_stage
+from dehyst.sim.diagnosis.prepare import prepare
+from dehyst.sim.diagnosis.result import TEST, Diagnosis
+from dehyst.sim.effects import Chain, effect
+from dehyst.sim.effects.timing import find_slips
+from dehyst.sim.fitting.modes import peaks
+from dehyst.sim.recordings import Recording, read
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 from tests.hidden.foreign.crops import contradict
 
 DT = 1e-3

@@ -11,17 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.diagnosis import diagnose
-from sim.diagnosis.diagnose import Options, explained_share, verdict_of
-from sim.diagnosis.nominal import calibrate_nominal, fit_on_other_recording
-from sim.diagnosis.result import Diagnosis, NamedCause
-from sim.diagnosis.search.held_out import split
-from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
-from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import ModelFit
-from sim.readings.noise import RepeatedReadings, is_noise, noise_floor, recording_defects, repeated_readings
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis import diagnose
+from dehyst.sim.diagnosis.diagnose import Options, explained_share, verdict_of
+from dehyst.sim.diagnosis.nominal import calibrate_nominal, fit_on_other_recording
+from dehyst.sim.diagnosis.result import Diagnosis, NamedCause
+from dehyst.sim.diagnosis.search.held_out import split
+from dehyst.sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.fitting.stage_model import ModelFit
+from dehyst.sim.readings.noise import RepeatedReadings, is_noise, noise_floor, recording_defects, repeated_readings
 
 DT = 1e-3
 SIGMA_UM = 0.01

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from adaptive.types import FloatArray
-from sim.diagnosis.witnesses import witnesses
-from sim.effects import CAUSES
-from sim.effects.timing import slips_are_borne_out
-from sim.fitting.fit_data import EARLY_S, FitData
-from sim.readings.cycles import mirrored_branches
-from sim.readings.readings import Readings
-from sim.readings.sight import Sight
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.effects import CAUSES
+from dehyst.sim.effects.timing import slips_are_borne_out
+from dehyst.sim.fitting.fit_data import EARLY_S, FitData
+from dehyst.sim.readings.cycles import mirrored_branches
+from dehyst.sim.readings.readings import Readings
+from dehyst.sim.readings.sight import Sight
 from tests.hidden.excitation import FS_HZ, excitation
 from tests.hidden.stage import Truth, record
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import StateSpace, cont2discrete
 
-from adaptive.errors import InputError
-from baselines.bouc_wen.model import BoucWenParameters
-from baselines.bouc_wen.step import hysteresis_step
-from sim.effects import CAUSES, EFFECTS, Chain, Effect, effect, simulate
-from sim.effects.holds import first_order, second_order
-from sim.signals.voltages import sine, triangle
+from dehyst.adaptive.errors import InputError
+from dehyst.baselines.bouc_wen.model import BoucWenParameters
+from dehyst.baselines.bouc_wen.step import hysteresis_step
+from dehyst.sim.effects import CAUSES, EFFECTS, Chain, Effect, effect, simulate
+from dehyst.sim.effects.holds import first_order, second_order
+from dehyst.sim.signals.voltages import sine, triangle
 
 # --- The effects library: registry, parameters, composition, exactness of the linear parts.
 
@@ -79,7 +79,7 @@ def test_registry_holds_the_catalogue() -> None:
 
 @pytest.mark.parametrize("kind", EFFECTS.values(), ids=str)
 def test_kind_is_complete(kind: object) -> None:
-    from sim.effects import Kind
+    from dehyst.sim.effects import Kind
 
     assert isinstance(kind, Kind)
     assert kind.signature

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import expm
 
-from adaptive.types import FloatArray
+from dehyst.adaptive.types import FloatArray
 
 
 def orthogonal_multisines(

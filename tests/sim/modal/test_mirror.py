@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.modal import ModalStudy, study
-from sim.modal.reading import read_periodic
-from sim.recordings import ColumnMap
+from dehyst.sim.modal import ModalStudy, study
+from dehyst.sim.modal.reading import read_periodic
+from dehyst.sim.recordings import ColumnMap
 
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 MIRROR = DATA / "fine_steering_mirror"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from adaptive.types import FloatArray
-from sim.modal import FitSettings, PeriodicRecord, average, fit_modes, frequency_response, output_errors, study
-from sim.modal.periods import joined, realisations
-from sim.modal.study import RAYLEIGH_RATIO
+from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
+from dehyst.sim.modal import FitSettings, PeriodicRecord, average, fit_modes, frequency_response, output_errors, study
+from dehyst.sim.modal.periods import joined, realisations
+from dehyst.sim.modal.study import RAYLEIGH_RATIO
 from tests.sim.modal import simulated
 
 DT_S = 1e-3

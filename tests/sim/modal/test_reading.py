@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from sim.modal.reading import read_periodic
-from sim.recordings import ColumnMap
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.modal.reading import read_periodic
+from dehyst.sim.recordings import ColumnMap
 
 
 def test_an_array_of_realisations_and_periods(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.recordings import Recording, read
-from sim.recordings.columns import ColumnMap
+from dehyst.sim.recordings import Recording, read
+from dehyst.sim.recordings.columns import ColumnMap
 
 N, DT_S = 600, 1e-3
 T_S = np.arange(N) * DT_S

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError
-from sim.recordings import Recording, check, repaired, require_usable
-from sim.recordings.findings import LARGEST_LEAD, lead
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings import Recording, check, repaired, require_usable
+from dehyst.sim.recordings.findings import LARGEST_LEAD, lead
 from tests.hidden.foreign.cases import pair
 from tests.hidden.foreign.score import recording_of
 
@@ -268,9 +268,9 @@ def test_repair_puts_every_good_sample_where_it_was(gone: set[int], nans: set[in
 
 @pytest.mark.parametrize("name", ["rich", "bouc_wen"])
 def test_simulated_stages_are_healthy_and_swapped_ones_are_seen(name: str) -> None:
-    from sim.signals.voltages import training_input
-    from sim.stage.presets import preset
-    from sim.stage.stage import Stage
+    from dehyst.sim.signals.voltages import training_input
+    from dehyst.sim.stage.presets import preset
+    from dehyst.sim.stage.stage import Stage
 
     t_s, u_V = training_input(DT, 10.0)[:2]
     stage = Stage(preset(name, dt_s=DT))

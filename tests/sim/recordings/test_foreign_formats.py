@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 from scipy.io import savemat
 
-from adaptive.errors import InputError
-from sim.recordings import ColumnMap, Recording, array_formats, check, load_map, read
-from sim.recordings.columns import MissingError
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings import ColumnMap, Recording, array_formats, check, load_map, read
+from dehyst.sim.recordings.columns import MissingError
 
 N, DT_S = 240, 0.002
 T = np.arange(N) * DT_S
@@ -811,7 +811,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(
 
 def test_reading_text_imports_none_of_the_packages(tmp_path: Path) -> None:
     program = (
-        "import sys; from sim.recordings import read; read(sys.argv[1]); "
+        "import sys; from dehyst.sim.recordings import read; read(sys.argv[1]); "
         "sys.exit(any(name in sys.modules for name in ('h5py', 'nptdms', 'openpyxl')))"
     )
     path = write_text(tmp_path / "a.csv", "t_s,u_V,y_um")

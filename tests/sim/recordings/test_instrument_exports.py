@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
-from sim.recordings import ColumnMap, Recording, read
-from sim.recordings.columns import MissingError, unit_of_name
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings import ColumnMap, Recording, read
+from dehyst.sim.recordings.columns import MissingError, unit_of_name
 
 N, DT_S = 300, 1e-3
 T = np.arange(N) * DT_S
@@ -164,8 +164,8 @@ def test_times_of_day_over_midnight(tmp_path: Path) -> None:
 DAMAGE = """
 import random, sys
 from pathlib import Path
-from adaptive.errors import InputError
-from sim.recordings import read
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings import read
 
 def damaged(rng):
     sep = rng.choice([",", ";", "\\t", " "])
@@ -213,7 +213,8 @@ def test_no_thread_is_left_after_reading_text(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("t_s,u_V,y_um\n" + rows(T, U, Y))
     code = (
-        "import os, sys; from sim.recordings import read; from pathlib import Path; p = Path('/proc/self/task');\n"
+        "import os, sys; from dehyst.sim.recordings import read\n"
+        "from pathlib import Path; p = Path('/proc/self/task');\n"
         "before = len(list(p.iterdir())) if p.is_dir() else 0; read(sys.argv[1]);\n"
         "after = len(list(p.iterdir())) if p.is_dir() else 0; print(after - before, 'pyarrow' in sys.modules)"
     )

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 from scipy.io import savemat
 
-from adaptive.errors import InputError
-from sim.recordings import ColumnMap, Recording, load_map, read
+from dehyst.adaptive.errors import InputError
+from dehyst.sim.recordings import ColumnMap, Recording, load_map, read
 
 N = 300
 T = np.arange(N) * 0.002
@@ -285,7 +285,7 @@ def test_measured_files_of_every_folder() -> None:
 
 
 def test_findings_are_json(tmp_path: Path) -> None:
-    from sim.recordings import check
+    from dehyst.sim.recordings import check
 
     findings = check(read(write_gcs(tmp_path / "b.dat", ndata=N + 5), GCS_MAP))
     assert json.loads(json.dumps([finding.as_dict() for finding in findings]))

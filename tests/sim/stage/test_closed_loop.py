@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError, NumericsError
-from adaptive.types import Feedforward, FloatArray, StateDict
-from sim.effects import Chain, effect
-from sim.signals.references import demo_reference
-from sim.stage.closed_loop import CHAPTER_GAINS, PID, track, ultimate_gain
-from sim.stage.config import StageConfig
-from sim.stage.presets import preset
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, NumericsError
+from dehyst.adaptive.types import Feedforward, FloatArray, StateDict
+from dehyst.sim.effects import Chain, effect
+from dehyst.sim.signals.references import demo_reference
+from dehyst.sim.stage.closed_loop import CHAPTER_GAINS, PID, track, ultimate_gain
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
 

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptive.errors import InputError, ModelFileError
-from sim.effects import EFFECTS, Chain
-from sim.signals.voltages import growing_triangles, training_input, triangle
-from sim.stage.config import StageConfig
-from sim.stage.file import from_dict, load_stage, save_stage, to_dict
-from sim.stage.presets import PRESETS, preset, rich_chain
-from sim.stage.stage import Stage
+from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.sim.effects import EFFECTS, Chain
+from dehyst.sim.signals.voltages import growing_triangles, training_input, triangle
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.file import from_dict, load_stage, save_stage, to_dict
+from dehyst.sim.stage.presets import PRESETS, preset, rich_chain
+from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
 EVERYTHING = StageConfig(
