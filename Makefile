@@ -11,7 +11,7 @@ PROCESSES := $(addprefix tests/e2e/,test_soak.py test_scale.py test_demo.py) \
           $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py) \
           $(addprefix tests/service/,viewer/test_sink.py viewer/test_live.py operating security \
           server/test_process.py server/test_gap_live.py storage/test_recorder.py storage/test_folders.py \
-          stage_node fleet adapters client protocol/test_protocol_page.py background/test_priority.py \
+          stage_node fleet adapters commissioning client protocol/test_protocol_page.py background/test_priority.py \
           runtime/test_memory.py runtime/test_stopping.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
@@ -65,8 +65,8 @@ test-computing: .setup-test
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone and not long" \
 	    $(addprefix --ignore=,$(PROCESSES))
 
-test-long: .setup-test ## whole diagnoses of records of other generators (ten minutes)
-	$(BIN)/python -m pytest -n 2 --dist load -m long tests/sim
+test-long: .setup-test ## whole diagnoses of records of other generators, whole commissionings (ten minutes)
+	$(BIN)/python -m pytest -n 2 --dist load -m long tests/sim tests/service/commissioning
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
 	@sh clients/test.sh

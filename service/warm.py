@@ -60,7 +60,7 @@ def at_first_use(root: Path = _ROOT) -> None:
 
     Where its folder cannot be written to, numba compiles each loop for the user when it is called.
     """
-    if root.name in _INSTALLED and os.access(root / "service", os.W_OK):
+    if root.parent.name in _INSTALLED and os.access(root / "service", os.W_OK):
         compile_all(root, sys.stderr)
 
 
@@ -78,8 +78,10 @@ def compile_all(root: Path, out: TextIO) -> int:
     forget(root)
     start = time.perf_counter()
     print("compiling the loops, once: 2 minutes on two idle cores, longer on busy ones ...", file=out, flush=True)
+    # Where `dehyst` is imported from: beside the parts in a checkout, above them in an installation.
+    home = root.parent if root.parent.name in _INSTALLED else root
     children = [
-        subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
+        subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=home)
         for group in GROUPS
     ]
     failed: list[object] = list(make_bytecode(root))

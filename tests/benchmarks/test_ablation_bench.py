@@ -127,7 +127,7 @@ def test_a_shift_reaches_importers() -> None:
 
 def test_what_is_read_at_import_is_not_shifted() -> None:
     half, twice = variants_of(constant("gates.ABSURD"))
-    assert half.impossible == twice.impossible == "read while adaptive.online.gates is imported"
+    assert half.impossible == twice.impossible == "read while dehyst.adaptive.online.gates is imported"
 
 
 # ---- comparison

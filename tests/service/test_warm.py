@@ -25,12 +25,13 @@ def test_bytecode_is_made_of_every_module(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def installation(root: Path) -> Path:
-    """A folder with the packages, in which each group's `warm` leaves a line in ``root/warmed``."""
-    for package in PACKAGES:
-        (root / package).mkdir(parents=True)
+    """``root/dehyst`` with the packages, in which each group's `warm` leaves a line in the file ``warmed``."""
+    where, root = root, root / "dehyst"
+    for package in (".", *PACKAGES):
+        (root / package).mkdir(parents=True, exist_ok=True)
         (root / package / "__init__.py").touch()
     for name in (name for group in GROUPS for name in group):
-        path = root.joinpath(*name.split(".")).with_suffix(".py")
+        path = where.joinpath(*name.split(".")).with_suffix(".py")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"def warm():\n    print({name!r}, file=open({str(root / 'warmed')!r}, 'a'))\n")
     (root / "service" / "answers" / "__init__.py").touch()
@@ -57,8 +58,8 @@ def test_a_log_shows_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = installation(tmp_path / "site-packages")
-    warm = root.joinpath(*GROUPS[0][0].split(".")).with_suffix(".py")
-    warm.write_text("import time\ndef warm():\n    open('sim/loop.nbi', 'w').close()\n    time.sleep(2.0)\n")
+    warm = root.parent.joinpath(*GROUPS[0][0].split(".")).with_suffix(".py")
+    warm.write_text("import time\ndef warm():\n    open('dehyst/sim/loop.nbi', 'w').close()\n    time.sleep(2.0)\n")
     monkeypatch.setattr("dehyst.service.warm._SAID_EVERY_S", 0.5)
     at_first_use(root)
     first, *lines = capsys.readouterr().err.splitlines()

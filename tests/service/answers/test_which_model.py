@@ -92,7 +92,7 @@ def test_flags_of_a_point_and_who_gave_it_say_the_same() -> None:
 
 @pytest.mark.parametrize(
     ("trust", "trouble", "answers"),
-    [(1.0, "", Answering.LEARNT), (1.0, "rail", Answering.IDENTIFIED), (1.0, "sensor_sign", Answering.LAST_GOOD),
+    [(1.0, "", Answering.LEARNT), (1.0, "sensor_sign", Answering.LAST_GOOD),
      (0.5, "sensor_sign", Answering.BLENDED), (0.0, "sensor_sign", Answering.STAND_IN)],
 )  # fmt: skip
 def test_a_follower_says_it_of_its_last_voltage(trust: float, trouble: str, answers: Answering) -> None:

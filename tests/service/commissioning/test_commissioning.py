@@ -126,6 +126,7 @@ def test_a_fault_is_named_and_the_stage_goes_back_to_rest(
 @needs_pipython
 @pytest.mark.e2e
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_noise_fifty_times_too_large_stands_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, shorter_s in (("_TRAIN_S", 8.0), ("_SWEEP_S", 2.0), ("_HELD_S", 6.0)):
@@ -172,6 +173,7 @@ def stage_file(folder: Path, port: int) -> list[str]:
 @needs_pipython
 @pytest.mark.e2e
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_the_command_takes_three_minutes_at_most_and_its_model_is_served(tmp_path: Path) -> None:
     """With a target that a loaded machine reaches, where many samples come late."""
