@@ -131,7 +131,7 @@ class Ticks:
     Attributes
     ----------
     late : ticks that were late by more than `LATE_SHARE` of the sample time, and those that were left out.
-    worst_late_s : largest lateness of the others, s.
+    worst_late_s : largest lateness of all, s.
     """
 
     def __init__(self, rate_Hz: float, n: int | None = None, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -148,6 +148,7 @@ class Ticks:
                 time.sleep(k * dt_s - now_s)
                 now_s = time.perf_counter() - start
             behind_s = now_s - k * dt_s
+            self.worst_late_s = max(self.worst_late_s, behind_s)
             missed = int(behind_s / dt_s)
             if missed > 0:
                 last = k + missed if self._n is None else min(k + missed, self._n)
@@ -155,9 +156,6 @@ class Ticks:
                 k = last
                 continue
             late = behind_s > LATE_SHARE * dt_s
-            if late:
-                self.late += 1
-            else:
-                self.worst_late_s = max(self.worst_late_s, behind_s)
+            self.late += late
             yield Tick(k, now_s, late)
             k += 1

@@ -25,7 +25,7 @@ _PROGRESS_S = 1.0
 class StageRecording(NamedTuple):
     """A recording: (n,) times, s, applied voltages, V, and readings, µm.
 
-    ``late`` sample times are missing, because the loop was late; ``worst_late_ms`` is the lateness of the others.
+    ``late`` sample times are missing, because the loop was late; ``worst_late_ms`` is the largest lateness.
     """
 
     t_s: FloatArray

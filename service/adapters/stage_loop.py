@@ -34,7 +34,7 @@ class LoopSummary:
     Attributes
     ----------
     samples : taken. late : sample times at which the loop was too late (`service.adapters.adapter.LATE_SHARE`): they
-        are no samples. worst_late_ms : lateness of the samples, ms.
+        are no samples. worst_late_ms : largest lateness of a sample time, ms.
     limited : voltages that were not finite, or changed by the limits of voltage or slew rate.
     published, lost : samples by the network.
     missing : voltages that had not come in time, where they come over the network.
