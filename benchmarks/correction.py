@@ -19,7 +19,7 @@ import math
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -374,20 +374,25 @@ def lines(course: Course, got: Record) -> Record:
     return {"lines": [float(error[line == k].mean()) for k in range(LINES)], **counts}
 
 
+def run_one(course: Course, way: str, age: int, case: str, measure: Callable[[Course, Record], Record]) -> Record:
+    """One run by its measures; one that raises has its traceback, and the others go on."""
+    record: Record = {
+        "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
+        "dt_s": course.known.dt_s,
+    }  # fmt: skip
+    try:
+        return record | measure(course, follow(course, way, age, case))
+    except Exception:
+        return record | {"failed": traceback.format_exc()}
+
+
 def run_rasters(course: Course, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:
     """All runs of a stage along rasters; a run that raises has its traceback."""
     records = []
     for frequency_Hz, age, way in itertools.product(RASTERS_HZ, ages, ways):
         there = course.raster(frequency_Hz)
-        record: Record = {
-            "seed": course.seed, "case": RASTER, "way": way, "age": age, "frequency_Hz": frequency_Hz,
-            "hysteresis": course.name, "dt_s": course.known.dt_s, "mode_Hz": course.mode_Hz,
-        }  # fmt: skip
-        try:
-            record |= lines(there, follow(there, way, age, RASTER))
-        except Exception:
-            record["failed"] = traceback.format_exc()
-        records.append(record)
+        more = {"frequency_Hz": frequency_Hz, "mode_Hz": course.mode_Hz}
+        records.append(run_one(there, way, age, RASTER, lines) | more)
     return records
 
 
@@ -398,16 +403,7 @@ def run_stage(course: Course, cases: Sequence[str] = tuple(CASES)) -> list[Recor
         ways, ages = CASES[case]
         there = course.at_rest() if case == "rest" else course
         for age in ages:
-            for way in ways:
-                record: Record = {
-                    "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
-                    "dt_s": course.known.dt_s,
-                }  # fmt: skip
-                try:
-                    record |= figures(there, follow(there, way, age, case))
-                except Exception:
-                    record["failed"] = traceback.format_exc()
-                records.append(record)
+            records += [run_one(there, way, age, case, figures) for way in ways]
     return records
 
 

@@ -94,7 +94,10 @@ class PiStage:
         return Stated(servo, unit, math.nan if low is None or high is None else float(high) - float(low))
 
     def _said(self, query: Callable[[str], Any]) -> Any:
-        """The reply to a query; None from a controller that does not know it."""
+        """The reply to a query; None from a controller that does not know it.
+
+        A lost connection is raised by the next reading.
+        """
         try:
             return query(self._axis)[self._axis]
         except Exception:

@@ -26,6 +26,19 @@ DT_S = 1e-3
 GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
 
 
+class Clock:
+    """Stands in for the module `time` of a loop: time passes in sleeps alone, whatever the load of the machine."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_s += duration_s
+
+
 def make_models(dt_s: float = DT_S) -> dict[str, InverseModel]:
     """A line, and an LSSVM with plays whose kernel part is small: both good enough to steer a stage of 11 µm/V."""
     features = FeatureMap(

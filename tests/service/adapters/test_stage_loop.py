@@ -19,19 +19,7 @@ from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
 from dehyst.service.protocol.samples import encode_command
 from dehyst.sim.recordings import ColumnMap, read
-
-
-class Clock:
-    """Stands in for the module `time` of the loop: time passes in sleeps alone, whatever the load of the machine."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now_s
-
-    def sleep(self, duration_s: float) -> None:
-        self.now_s += duration_s
+from tests.service.conftest import Clock
 
 
 @pytest.fixture(autouse=True)

@@ -32,7 +32,7 @@ from dehyst.service.commissioning.mover import Order, Piece, StageFault
 from dehyst.service.config.settings import read_config
 from dehyst.service.runtime.stopping import STOPS
 from dehyst.service.storage.model_file import read_bundle
-from tests.service.conftest import unused_port
+from tests.service.conftest import Clock, unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
 LIMITS = Limits(0.0, 80.0, 400.0)
@@ -227,19 +227,6 @@ def test_ctrl_c_ramps_the_stage_back_and_keeps_the_recording(tmp_path: Path) -> 
 
 
 # --- In virtual time: numbers that do not depend on the load of the machine.
-
-
-class Clock:
-    """Stands in for the module `time`: time passes in sleeps alone."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now_s
-
-    def sleep(self, duration_s: float) -> None:
-        self.now_s += duration_s
 
 
 @pytest.fixture
