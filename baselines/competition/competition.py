@@ -271,14 +271,12 @@ class ChampionChoice:
         c, now, best = self.config, self.champion, int(np.argmin(errors_V))
         if math.isinf(errors_V[now]) and math.isfinite(errors_V[best]):
             return self._replace_by(best, FAILED)
-        # The favourite returns as soon as it is no worse; a challenger must win by the margin and the floor.
-        other = 0 if now != 0 and errors_V[0] < errors_V[now] else best
-        margin, floor_V = (1.0, 0.0) if other == 0 else (c.margin, c.floor * self.span_V)
-        ahead = other != now and errors_V[now] > margin * errors_V[other] + floor_V
+        # The favourite returns as soon as it is no worse; a challenger must win by the margin and the floor for a while.
+        if now != 0 and errors_V[0] < errors_V[now]:
+            return self._replace_by(0, BETTER)
+        ahead = best not in (0, now) and errors_V[now] > c.margin * errors_V[best] + c.floor * self.span_V
         self.ahead_s = self.ahead_s + scored_s if ahead else 0.0
-        if ahead and self.ahead_s >= c.patience_s:
-            return self._replace_by(other, BETTER)
-        return ""
+        return self._replace_by(best, BETTER) if ahead and self.ahead_s >= c.patience_s else ""
 
     def _replace_by(self, champion: int, why: str) -> str:
         self.champion, self.ahead_s = champion, 0.0

@@ -20,7 +20,7 @@ class CompetitionConfig:
     margin : factor by which the champion's rms error must exceed that of a challenger.
     floor : difference of the two errors beyond that, as a share of the voltage span.
     patience_s : time for which both must hold before the challenger replaces the champion, s of scored motion. The
-        favourite returns without margin and floor.
+        favourite returns at once, without margin and floor.
     blend_s : duration of a change of champion in a caller's stream of points, s.
 
     Raises InputError on a value out of range.
@@ -28,7 +28,7 @@ class CompetitionConfig:
 
     block: int = 20
     serving_age_s: float = 0.08
-    horizon_s: float = 0.5
+    horizon_s: float = 0.25
     margin: float = 1.25
     floor: float = 0.0005
     patience_s: float = 0.5

@@ -192,6 +192,14 @@ def test_a_challenger_needs_margin_and_floor_and_the_favourite_neither() -> None
     assert reign((0.2, 0.11, 0.1), champion=1).champion == 1
 
 
+def test_the_favourite_returns_with_the_first_judgement_that_finds_it_no_worse() -> None:
+    """Served by another, callers get the other's errors: every second of patience costs them."""
+    made = ChampionChoice(CompetitionConfig(patience_s=0.5), SPAN_V, champion=1)
+    assert made.choose((0.11, 0.1), 0.02) == ""
+    assert made.choose((0.0999, 0.1), 0.02) == BETTER
+    assert (made.champion, made.changes) == (0, 1)
+
+
 def test_patience_is_counted_in_motion_and_begins_anew_when_the_lead_is_lost() -> None:
     made = ChampionChoice(CompetitionConfig(patience_s=0.5), SPAN_V)
     for k in range(100):
