@@ -66,7 +66,6 @@ class Kept(Enum):
 
     NEWEST = "the learner's newest"
     GOOD = "the last that was served"
-    NEWER = "one served 0.1 to 1 s before"
     OLDER = "one served 0.5 to 1 s before"
 
 
@@ -105,7 +104,8 @@ RULES: Final[Mapping[str, Rule]] = {
     "sensor_gain": _WRONG,
     "sensor_foreign": _WRONG,
     "out_of_envelope": _WRONG,
-    VOLTAGE_DIFFERS: Rule(Answering.LAST_GOOD, Kept.NEWER, teaches=False),
+    # No sample is learnt from the first that differs on, so the newest model is from before.
+    VOLTAGE_DIFFERS: Rule(Answering.LAST_GOOD, Kept.GOOD, teaches=False),
     MODEL_BAD: _UNFIT,
     LEARNER_FAILED: _UNFIT,
 }
@@ -126,9 +126,8 @@ _SWEEP: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9, 1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
 INSANE_SHARE: Final = 1.0
 #: Time without a sign of a trouble after which it is over, s.
 RECOVER_S: Final = 0.5
-#: Age from which a model counts as one from before a trouble; and time in which a wrong voltage may still be too near
-#: the commanded one to be noticed, s.
-MARK_S, UNSEEN_S = 0.5, 0.1
+#: Age from which a model counts as one from before a trouble, s.
+MARK_S: Final = 0.5
 #: Time in which the trust goes to 0 once a trouble has lasted for ``last_good_s``, and comes back, s.
 RAMP_S: Final = 1.0
 
@@ -204,12 +203,8 @@ class ModelChoice:
         if not self.trouble:
             self._since = now
         self.trouble = trouble
-        kept = self.rule.kept
-        if kept is Kept.OLDER and self._mark is not None:
+        if self.rule.kept is Kept.OLDER and self._mark is not None:
             self.good = self._next_mark = self._mark
-        if kept is Kept.NEWER and self._mark is not None:
-            fresh = (now - self._marked) * self._dt_s < UNSEEN_S
-            self.good = self._mark if fresh or self._next_mark is None else self._next_mark
 
     def _trouble_of_model(self, candidate: InverseModel | None, identified: InverseModel | None) -> str:
         if candidate is None:

@@ -3,7 +3,9 @@
 A controller that asks for the next voltages names what is under way: the voltages that it has commanded, and the motion
 that they are for, by the numbers of the samples (`service.protocol.query.Pending`). A sample with such a number has to
 show that voltage. Where many in a row do not, the columns are exchanged, scaled or late, or the samples are those of
-another stage. Then what was commanded is the better witness of both voltage and place.
+another stage. Then what was commanded is the better witness of both voltage and place, from the first such sample on:
+a place of another stage would otherwise stay in the memory of the hysteresis. Only a sample that shows the voltage of
+the one before is believed until the difference is named: a stage that missed a command holds its voltage.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class CommandWitness:
         self._claims: tuple[Pending, ...] = ()
         self._doubt = 0
         self._credit = 0
-        self._moved_V = float("nan")
+        self._moved_V = self._shown_V = float("nan")
         #: What the last one that differed showed, in words; "" while the samples agree.
         self.why = ""
 
@@ -73,7 +75,7 @@ class CommandWitness:
             near_V = claim.u_V[max(0, k - _NEIGHBOURS) : k + 1 + _NEIGHBOURS]
             if near_V.min() - self._tolerance_V <= u_V <= near_V.max() + self._tolerance_V:
                 self._agrees(u_V)
-                return known if self.why else None
+                return self._stands_in(known, u_V)
             known = known or (float(claim.u_V[k]), float(claim.y_um[k]))
         if known is not None:
             self._differs(seq, u_V, known[0])
@@ -81,7 +83,15 @@ class CommandWitness:
             # What is over is dropped: otherwise each later sample would look through all of it.
             self._claims = tuple(claim for claim in self._claims if claim.first + claim.u_V.size > seq)
             self._believe()
-        return known if self.why else None
+        return self._stands_in(known, u_V)
+
+    def _stands_in(self, known: tuple[float, float] | None, u_V: float) -> tuple[float, float] | None:
+        """What is to be believed in place of a sample, of which ``known`` was commanded; None for the sample itself."""
+        if known is None or not self.doubts:
+            self._shown_V = u_V
+            return None
+        held = not self.why and not abs(u_V - self._shown_V) > self._tolerance_V
+        return None if held else known
 
     def _agrees(self, u_V: float) -> None:
         # A stage that holds its place agrees with everybody who has asked for that place.

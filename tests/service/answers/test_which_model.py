@@ -142,7 +142,7 @@ class Life:
 #: By trouble: how many snapshots of 0.02 s the served model is old when the trouble is named after 100 of them.
 AGES = {
     **dict.fromkeys(("sensor_frozen", "samples_poisoned", *SENSOR_FAULTS), (25, 50)),
-    "voltage_differs": (5, 50),
+    "voltage_differs": (1, 1),
     "model_bad": (1, 1),
     "learner_failed": (1, 1),
     **dict.fromkeys(("", "nothing_learnt"), (0, 0)),
