@@ -271,7 +271,7 @@ class ChampionChoice:
         c, now, best = self.config, self.champion, int(np.argmin(errors_V))
         if math.isinf(errors_V[now]) and math.isfinite(errors_V[best]):
             return self._replace_by(best, FAILED)
-        # The favourite returns as soon as it is no worse; a challenger must win by the margin and the floor for a while.
+        # The favourite returns as soon as it is no worse; others must win by the margin and the floor for a while.
         if now != 0 and errors_V[0] < errors_V[now]:
             return self._replace_by(0, BETTER)
         ahead = best not in (0, now) and errors_V[now] > c.margin * errors_V[best] + c.floor * self.span_V
