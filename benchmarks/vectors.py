@@ -28,7 +28,9 @@ from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.baselines.linear import LinearInverse, LinearParameters
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from dehyst.service.answers.answering import Served, answer, blends, learns
-from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.guard import Limits, limit_voltage
+from dehyst.service.client.correcting import Correcting
+from dehyst.service.config.correction import CorrectionConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
 from dehyst.service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
@@ -125,6 +127,7 @@ class Snapshot:
     trust: float = 1.0
     default: str = LEARNING
     learn: str = LEARNING
+    trouble: str = ""
     memory: FloatArray | None = field(default=None)
 
     @property
@@ -150,6 +153,7 @@ class Snapshot:
         safety = Safety(
             blends(self.name, self.default, config), config.blend_share, self.trust if learning else 1.0,
             config.stale_s if learning else 0.0, config.last_good_s, served.standing_in_for(self.name),
+            self.trouble,
         )  # fmt: skip
         return encode_model(self.name, self.model, self.seq, served.memories[self.name], safety)
 
@@ -203,6 +207,7 @@ def snapshots() -> dict[str, Snapshot]:
         Snapshot("lssvm-bare", LEARNING, bare, stand_in=LINE),
         Snapshot("lssvm-without-arcs", LEARNING, in_frame(arcless, JUMPED)),
         Snapshot("lssvm-distrusted", LEARNING, in_frame(small, JUMPED), seq=4500, stand_in=BOUC_WEN, trust=0.4),
+        Snapshot("lssvm-troubled", LEARNING, in_frame(small, JUMPED), seq=4500, trouble="sensor_stuck"),
         Snapshot("lssvm-compared", "lssvm", replace(small, name="lssvm"), stand_in=MPI),
         Snapshot("overflowing", "linear", replace(LINE, parameters=LinearParameters(1e-307, 1.0)), stand_in=MPI),
         Snapshot("overflowing-alone", "linear", replace(LINE, parameters=LinearParameters(1e-307, 1.0))),
@@ -568,6 +573,49 @@ def authenticators() -> list[str]:
     return table
 
 
+#: Settings of the correction of `correction_lines`, as in a status.
+CORRECTION: Final = CorrectionConfig(on=True, share=0.004, mode_Hz=200.0, fade_s=0.05)
+
+
+def correction_lines() -> list[str]:
+    """What a follower that corrects gives for each point: readings that are late, doubted, missing, or oscillate."""
+    made, correcting = snapshots(), Correcting(CORRECTION, LIMITS, DT_S)
+    now, memory, u_V = made["lssvm"], moved(made["lssvm"].model), math.nan
+    settings = (CORRECTION.share, CORRECTION.mode_Hz, CORRECTION.fade_s)
+    table = [
+        f"# lssvm.model.payload {' '.join(map(repr, settings))}",
+        "# seq y_um v_um_per_s change read_seq read_um u_V correction_V age halved doubted",
+    ]
+    noise_um = 0.003 * (np.arange(1200) * 7919 % 13 - 6) / 6.0
+    y = np.where(np.arange(1200) < 700, 40.0 + 0.01 * np.arange(1200), 47.0)  # a slow way up, and rest
+    v = np.where(np.arange(1200) < 700, 10.0, 0.0)
+    for k in range(1200):
+        change = {400: "lssvm-jumped", 1100: "lssvm-troubled"}.get(k, "")
+        now = made[change] if change else now
+        model = now.model
+        seen, read_um = k - (1 if k < 100 else 3), math.nan
+        if k >= 3 and not 300 <= k < 380:
+            read_um = float(y[seen] - 0.03 + noise_um[k])
+            read_um += 5.0 if k in (60, 61, 250) else 0.0
+            read_um += 0.2 * (1.0 if k % 20 < 10 else -1.0) if 500 <= k < 680 else 0.0
+            correcting.read([seen], [read_um])
+        points = y[k : k + 1], v[k : k + 1], np.zeros(1)
+        got = model.feedforward(*points, memory)
+        answered = got.u_V, float(got.std_V[0])
+        added_V = float(correcting.voltage(k, model, points, memory, answered, now.trouble)[0])
+        step_V = LIMITS.slew_V_per_s * DT_S
+        u_V, flags = limit_voltage(float(got.u_V[0]) + added_V, u_V, LIMITS.u_min_V, LIMITS.u_max_V, step_V)
+        if flags or not got.inside[0]:
+            correcting.leave_out(k, np.ones(1))
+        memory, integral = got.memory, correcting.correction
+        assert integral is not None
+        file, reading = f"{change}.model.payload" if change else "-", seen if math.isfinite(read_um) else "-"
+        row = (k, float(y[k]), float(v[k]), file, reading, read_um, u_V)
+        state = (integral.u_V, correcting.age, integral.halved, integral.doubted)
+        table.append(" ".join(map(str, (*row, *state))))
+    return table
+
+
 def write(out: Path) -> int:
     """Write all files to ``out``, which is created; returns the bytes written."""
     out.mkdir(parents=True, exist_ok=True)
@@ -614,6 +662,7 @@ def write(out: Path) -> int:
         files[f"refused-{name}.payload"] = payload
         table.append(f"refused-{name}.payload {kind} {at}")
     files["refused.txt"] = ("\n".join(table) + "\n").encode()
+    files["correction.txt"] = ("\n".join(correction_lines()) + "\n").encode()
     files["authenticators.txt"] = ("\n".join(authenticators()) + "\n").encode()
     for name, payload in files.items():
         (out / name).write_bytes(payload)

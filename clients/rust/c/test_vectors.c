@@ -265,6 +265,59 @@ static int authenticators(const char *folder) {
     return checked;
 }
 
+static int corrections(const char *folder, const dehyst_limits *limits) {
+    char path[1024], line[1024], model[80], change[80], read_seq[32];
+    snprintf(path, sizeof path, "%s/correction.txt", folder);
+    FILE *file = fopen(path, "r");
+    dehyst_correction settings;
+    CHECK(file && fgets(line, sizeof line, file) &&
+              sscanf(line, "# %79s %lf %lf %lf", model, &settings.share, &settings.mode_Hz, &settings.fade_s) == 4,
+          "correction.txt");
+    if (!file)
+        return 0;
+    payload first = load(folder, model);
+    dehyst *handle = NULL;
+    CHECK(dehyst_open_payload(first.bytes, first.length, limits, &handle) == 0, "%s", dehyst_error());
+    CHECK(dehyst_corrected(handle, 1, NULL) == -1 && strstr(dehyst_error(), "dehyst_correct"), "no correction yet");
+    dehyst_correction bad = settings;
+    bad.mode_Hz = 0.0;
+    CHECK(dehyst_correct(handle, &bad) == -1 && strstr(dehyst_error(), "mode_Hz"), "a mode of 0 Hz");
+    CHECK(dehyst_correct(handle, &settings) == 0, "%s", dehyst_error());
+    CHECK(dehyst_number(handle, -1) == -1 && dehyst_number(NULL, 1) == -1, "a number below 0, no handle");
+    int checked = 0;
+    while (fgets(line, sizeof line, file)) {
+        double y, v, read_um, u_V, added_V;
+        long long seq, age;
+        unsigned long long halved, doubted;
+        if (line[0] == '#')
+            continue;
+        int got = sscanf(line, "%lld %lf %lf %79s %31s %lf %lf %lf %lld %llu %llu", &seq, &y, &v, change, read_seq,
+                         &read_um, &u_V, &added_V, &age, &halved, &doubted);
+        CHECK(got == 11, "correction.txt: %s", line);
+        if (strcmp(change, "-")) {
+            payload other = load(folder, change);
+            CHECK(dehyst_update(handle, other.bytes, other.length) == 0, "%s", dehyst_error());
+            free(other.bytes);
+        }
+        if (strcmp(read_seq, "-")) {
+            int64_t number = atoll(read_seq);
+            CHECK(dehyst_read(handle, 1, &number, &read_um) == 0, "%s", dehyst_error());
+        }
+        dehyst_answer answer;
+        dehyst_corrected_t state;
+        CHECK(dehyst_number(handle, seq) == 0 && dehyst_point(handle, y, v, 0.0, &answer) == 0, "%s", dehyst_error());
+        CHECK(dehyst_corrected(handle, 1, &state) == 0, "%s", dehyst_error());
+        same("correction", "u_V", (size_t)seq, answer.u_V, u_V);
+        same("correction", "correction_V", (size_t)seq, state.u_V, added_V);
+        CHECK(state.age == age && state.halved == halved && state.doubted == doubted, "state at %lld", seq);
+        checked++;
+    }
+    fclose(file);
+    dehyst_close(handle);
+    free(first.bytes);
+    return checked;
+}
+
 int main(int argc, char **argv) {
     if (argc != 2) {
         printf("usage: test_vectors FOLDER\n");
@@ -299,6 +352,7 @@ int main(int argc, char **argv) {
     CHECK(steps > 20, "%d steps of changes", steps);
     refusals(argv[1], &rows[0]);
     CHECK(authenticators(argv[1]) >= 6, "authenticators.txt");
+    CHECK(corrections(argv[1], &rows[0].limits) >= 1000, "correction.txt");
     printf("C: %zu queries, %d followed blocks, %d steps of changes: %d failures\n", count, followed, steps, failures);
     return failures ? 1 : 0;
 }

@@ -81,6 +81,32 @@ int dehyst_advance(dehyst *handle, size_t n, const double *y_um, const double *u
 /* The voltage for the next point of the wanted motion. */
 int dehyst_point(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2, dehyst_answer *answer);
 
+/* Correct the voltages by fresh readings (docs/correction.md); settings as the status of the service has them under
+ * "correction". Per sample: dehyst_read what has come, dehyst_number of the next point unless it counts on, then the
+ * point. */
+typedef struct {
+    double share;    /* largest correction as a share of the voltage range, above 0, up to 1 */
+    double mode_Hz;  /* lowest frequency at which the stage rings, with the heaviest payload */
+    double fade_s;   /* time over which a correction without good readings is let go */
+} dehyst_correction;
+int dehyst_correct(dehyst *handle, const dehyst_correction *settings);
+
+/* The next point is for sample seq (0 to 2^62). Without a number nothing is corrected. */
+int dehyst_number(dehyst *handle, int64_t seq);
+
+/* n readings of samples, rising. Those that were taken before are left out; an error changes nothing. */
+int dehyst_read(dehyst *handle, size_t n, const int64_t *seq, const double *y_um);
+
+/* on 0 lets the correction go, over fade_s. corrected may be NULL. */
+typedef struct {
+    double u_V;                /* the correction */
+    double factor;             /* share of the designed gain; an oscillation halves it */
+    double noise_um;           /* standard deviation of a reading */
+    int64_t age;               /* samples from a reading to the voltage that it changes */
+    uint64_t halved, doubted;  /* times that the gain was halved, readings that were not used */
+} dehyst_corrected_t;
+int dehyst_corrected(dehyst *handle, int on, dehyst_corrected_t *corrected);
+
 /* Evaluate a point on a copy of the memory and throw the answer away. Called some 50 us before dehyst_point with about the
  * same motion, it loads what a point reads into the caches. Memory, slew limit and report stay as they are. */
 int dehyst_warm(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2);

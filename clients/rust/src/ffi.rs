@@ -1,6 +1,7 @@
 //! The C interface of `include/dehyst.h`. Panics do not cross it.
 
 use crate::answer::{Limits, Out};
+use crate::correction::CorrectionSettings;
 use crate::delta::Update;
 use crate::error::{Error, Result};
 use crate::follower::{Follower, Publisher};
@@ -39,6 +40,23 @@ pub struct CPoint {
     u_v: f64,
     std_v: f64,
     flags: u32,
+}
+
+#[repr(C)]
+pub struct CCorrection {
+    share: f64,
+    mode_hz: f64,
+    fade_s: f64,
+}
+
+#[repr(C)]
+pub struct CCorrected {
+    u_v: f64,
+    factor: f64,
+    noise_um: f64,
+    age: i64,
+    halved: u64,
+    doubted: u64,
 }
 
 #[repr(C)]
@@ -195,6 +213,53 @@ pub unsafe extern "C" fn dehyst_start(handle: *mut Handle, u_before_v: f64) -> c
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_advance(handle: *mut Handle, n: usize, y_um: *const f64, u_v: *const f64) -> c_int {
     guarded(|| follower(handle)?.advance(read(y_um, n, "y_um")?, read(u_v, n, "u_V")?))
+}
+
+/// # Safety
+/// `handle` is open and not in use by another thread; `settings` is valid.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_correct(handle: *mut Handle, settings: *const CCorrection) -> c_int {
+    guarded(|| {
+        let CCorrection { share, mode_hz, fade_s } = *settings.as_ref().ok_or_else(|| missing("settings"))?;
+        follower(handle)?.correct(CorrectionSettings { share, mode_hz, fade_s })
+    })
+}
+
+/// # Safety
+/// `handle` is open and not in use by another thread.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_number(handle: *mut Handle, seq: i64) -> c_int {
+    guarded(|| follower(handle)?.number(seq))
+}
+
+/// # Safety
+/// `handle` is open and not in use by another thread; `seq` and `y_um` have `n` elements.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_read(handle: *mut Handle, n: usize, seq: *const i64, y_um: *const f64) -> c_int {
+    guarded(|| follower(handle)?.read(read(seq, n, "seq")?, read(y_um, n, "y_um")?))
+}
+
+/// # Safety
+/// `handle` is open and not in use by another thread; `corrected` is valid, or null.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_corrected(handle: *mut Handle, on: c_int, corrected: *mut CCorrected) -> c_int {
+    guarded(|| {
+        let correcting = follower(handle)?.correcting();
+        let own = correcting.ok_or_else(|| Error::new("handle", "no correction", "dehyst_correct before"))?;
+        own.on = on != 0;
+        if let Some(corrected) = corrected.as_mut() {
+            let integral = &own.integral;
+            *corrected = CCorrected {
+                u_v: integral.u_v,
+                factor: integral.factor,
+                noise_um: integral.noise_um,
+                age: own.age,
+                halved: integral.halved,
+                doubted: integral.doubted,
+            };
+        }
+        Ok(())
+    })
 }
 
 /// # Safety

@@ -7,6 +7,7 @@
 use crate::answer::{
     self, limit_voltage, Done, Limits, Motion, Out, BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE,
 };
+use crate::correction::{Correcting, CorrectionSettings};
 use crate::delta::{Changes, Update};
 use crate::error::{Error, Result};
 use crate::snapshot::Snapshot;
@@ -159,6 +160,9 @@ pub struct Follower {
     last: Point,
     done: Done,
     answered: u64,
+    correcting: Option<Correcting>,
+    /// Whether no voltage was answered since `start`: the correction begins where the stage is.
+    begins: bool,
 }
 
 impl Follower {
@@ -184,15 +188,46 @@ impl Follower {
             last: Point { std_v: f64::NAN, ..Point::default() },
             done: Done::default(),
             answered: 0,
+            correcting: None,
+            begins: false,
         })
+    }
+
+    /// Correct the voltages by the readings that `read` takes (docs/correction.md). Points need numbers: `number`.
+    pub fn correct(&mut self, settings: CorrectionSettings) -> Result<()> {
+        self.correcting = Some(Correcting::new(settings, &self.limits, self.current.snapshot.model.dt_s)?);
+        Ok(())
+    }
+
+    /// The correction, to look at and to switch.
+    pub fn correcting(&mut self) -> Option<&mut Correcting> {
+        self.correcting.as_mut()
+    }
+
+    /// The next point is for the sample `seq`; later points count on. Without a number nothing is corrected.
+    pub fn number(&mut self, seq: i64) -> Result<()> {
+        if !(0..=1 << 62).contains(&seq) {
+            return Err(Error::new("seq", seq, "0 to 2^62"));
+        }
+        if let Some(correcting) = &mut self.correcting {
+            correcting.number = seq;
+        }
+        Ok(())
+    }
+
+    /// Take readings, µm, of samples, rising, that the next voltages are corrected by. Nothing happens without
+    /// `correct`.
+    pub fn read(&mut self, seq: &[i64], y_um: &[f64]) -> Result<()> {
+        self.correcting.as_mut().map_or(Ok(()), |correcting| correcting.read(seq, y_um))
     }
 
     pub fn publisher(&self) -> Publisher {
         Publisher(self.mailbox.clone())
     }
 
-    /// Take the newest snapshot, if there is one. Wait-free.
-    fn refresh(&mut self) {
+    /// Take the newest snapshot, if there is one. Wait-free. What it changes at `next`, the next point, leaves the
+    /// correction.
+    fn refresh(&mut self, next: Option<[f64; 3]>) {
         let mailbox = &*self.mailbox;
         if mailbox.waiting.load(Ordering::Relaxed).is_null() || !mailbox.retired.load(Ordering::Acquire).is_null() {
             return;
@@ -206,6 +241,11 @@ impl Follower {
         // Another number of plays or contestants: the old memory means nothing to this model. Its own has the room.
         if newest.snapshot.memory.len() != self.memory.len() {
             std::mem::swap(&mut self.memory, &mut newest.snapshot.room);
+        } else if let (Some(next), Some(correcting)) = (next, &mut self.correcting) {
+            if correcting.integral.u_v != 0.0 && next.iter().all(|value| value.is_finite()) {
+                let before = voltage_at(&mut self.current.snapshot, &self.memory, next).0;
+                correcting.hand_over(voltage_at(&mut newest.snapshot, &self.memory, next).0 - before);
+            }
         }
         let old = std::mem::replace(&mut self.current, newest);
         mailbox.retired.store(Box::into_raw(old), Ordering::Release);
@@ -231,7 +271,7 @@ impl Follower {
     /// the same motion, it loads what a point reads into the caches; a newer snapshot is taken here. Memory, slew limit
     /// and report stay as they are.
     pub fn warm(&mut self, y_um: f64, v_um_per_s: f64, a_um_per_s2: f64) -> Result<()> {
-        self.refresh();
+        self.refresh(None);
         let motion = Motion { y_um: &[y_um], v_um_per_s: &[v_um_per_s], a_um_per_s2: &[a_um_per_s2] };
         motion.check(&self.limits)?;
         let age_s = self.age_s();
@@ -240,7 +280,7 @@ impl Follower {
         memory.copy_from_slice(&self.memory);
         let (mut u_v, mut std_v, mut flags) = ([0.0], [0.0], [0]);
         let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
-        answer::answer(snapshot, &mut memory, &motion, self.u_before_v, &self.limits, age_s, &mut out);
+        answer::answer(snapshot, &mut memory, &motion, self.u_before_v, &self.limits, age_s, |_| 0.0, &mut out);
         snapshot.spare = memory;
         // Without this the compiler may leave out what nobody reads.
         std::hint::black_box(u_v);
@@ -249,7 +289,8 @@ impl Follower {
 
     /// The voltages for the next points, one sample time apart. `v` and `a` may be empty for 0.
     pub fn block(&mut self, y_um: &[f64], v_um_per_s: &[f64], a_um_per_s2: &[f64], out: &mut Out) -> Result<()> {
-        self.refresh();
+        let at = |values: &[f64]| values.first().copied().unwrap_or(0.0);
+        self.refresh(Some([at(y_um), at(v_um_per_s), at(a_um_per_s2)]));
         let age_s = self.age_s();
         self.block_at(y_um, v_um_per_s, a_um_per_s2, age_s, out)
     }
@@ -270,7 +311,19 @@ impl Follower {
             return Err(Error::new("n", n, "at least one point, and as many places for the answers"));
         }
         let snapshot = &mut self.current.snapshot;
-        self.done = answer::answer(snapshot, &mut self.memory, &motion, self.u_before_v, &self.limits, age_s, out);
+        let mut correcting = self.correcting.as_mut().filter(|correcting| correcting.number >= 0);
+        if let Some(correcting) = &mut correcting {
+            let Snapshot { model, scratch, spare, .. } = &mut *snapshot;
+            correcting.ask(y_um, model, &self.memory, spare, scratch);
+        }
+        let troubled = !snapshot.trouble.is_empty() || snapshot.trust_by_age(age_s).1;
+        let correct = |std_v| correcting.as_mut().map_or(0.0, |correcting| correcting.voltage(n, std_v, troubled));
+        let (memory, before_v) = (&mut self.memory, self.u_before_v);
+        self.done = answer::answer(snapshot, memory, &motion, before_v, &self.limits, age_s, correct, out);
+        if let Some(correcting) = correcting {
+            correcting.answered(out.flags);
+        }
+        self.begins = false;
         self.last = Point { u_v: out.u_v[n - 1], std_v: out.std_v[n - 1], flags: out.flags[n - 1] };
         self.u_before_v = self.last.u_v;
         self.answered += n as u64;
@@ -280,7 +333,8 @@ impl Follower {
     /// Take the newest snapshot and its memory: that after sample `report().snapshot_seq`. The next voltage is free of
     /// the slew limit, unless `u_before_v` is finite. Then `advance` along what was commanded since.
     pub fn start(&mut self, u_before_v: f64) {
-        self.refresh();
+        self.refresh(None);
+        self.begins = self.correcting.is_some();
         self.memory.copy_from_slice(&self.current.snapshot.memory);
         self.u_before_v = u_before_v;
     }
@@ -296,15 +350,19 @@ impl Follower {
         }
         let Snapshot { model, scratch, .. } = &mut self.current.snapshot;
         model.advance(y_um, u_v, &mut self.memory, scratch);
-        if let Some(last) = u_v.last() {
+        if let (Some(last), Some(there)) = (u_v.last(), y_um.last()) {
             self.u_before_v = *last;
+            if let Some(correcting) = self.correcting.as_mut().filter(|_| self.begins) {
+                let (model_v, std_v) = voltage_at(&mut self.current.snapshot, &self.memory, [*there, 0.0, 0.0]);
+                correcting.begin(last - model_v, std_v);
+            }
         }
         Ok(())
     }
 
     /// The reply to a query from the newest snapshot, as the service would give it. Allocates.
     pub fn reply(&mut self, query: &[u8], age_s: Option<f64>) -> Result<Reply> {
-        self.refresh();
+        self.refresh(None);
         answer::reply(&mut self.current.snapshot, &Query::decode(query)?, &self.limits, age_s)
     }
 
@@ -349,6 +407,15 @@ impl Follower {
             source,
         }
     }
+}
+
+/// (voltage, V, deviation, V) of the model of `snapshot` at a point, on a copy of `memory`.
+fn voltage_at(snapshot: &mut Snapshot, memory: &[f64], point: [f64; 3]) -> (f64, f64) {
+    let Snapshot { model, scratch, spare, .. } = snapshot;
+    spare.copy_from_slice(memory);
+    let mut got = (f64::NAN, f64::NAN);
+    model.evaluate(1, |_| point, spare, scratch, |_, step| got = (step.u_v, step.std_v));
+    got
 }
 
 /// Names of the bits in flags, for people.

@@ -20,6 +20,7 @@
 
 pub mod answer;
 pub mod authenticator;
+pub mod correction;
 mod delta;
 mod error;
 pub mod ffi;
@@ -32,6 +33,7 @@ pub mod wire;
 
 pub use answer::{Limits, Motion, Out};
 pub use authenticator::Authenticator;
+pub use correction::{Correcting, CorrectionSettings};
 pub use delta::{Changes, Update};
 pub use error::{Error, Result};
 pub use follower::{flag_names, Follower, Point, Publisher, Report};

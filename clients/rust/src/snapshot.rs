@@ -25,6 +25,8 @@ pub struct Snapshot {
     /// 0: never stale.
     pub stale_s: f64,
     pub last_good_s: f64,
+    /// Name of what is wrong with samples or learner, empty for nothing.
+    pub trouble: String,
     pub stand_in: Option<StandIn>,
     pub(crate) scratch: Vec<f64>,
     /// Memory of the stand-in while it is evaluated, and its scratch.
@@ -85,6 +87,7 @@ impl Snapshot {
             trust,
             stale_s: of("stale_s", 0.0)?,
             last_good_s: of("last_good_s", 60.0)?,
+            trouble: safety.get("trouble").and_then(Value::text).unwrap_or_default().to_string(),
             stand_in,
             model,
         })

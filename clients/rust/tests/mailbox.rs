@@ -1,6 +1,6 @@
 //! What the follower promises to a real-time loop: no allocation in a point, and whole models only.
 
-use dehyst::{Follower, Limits, Out};
+use dehyst::{CorrectionSettings, Follower, Limits, Out};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -48,6 +48,7 @@ fn read(name: &str) -> Vec<u8> {
 fn points_and_blocks_allocate_and_free_nothing() {
     let (first, jumped, changed) = (read("auto"), read("auto-jumped"), read("auto-champion-changed"));
     let mut follower = Follower::new(&first, LIMITS).unwrap();
+    follower.correct(CorrectionSettings { share: 0.02, mode_hz: 200.0, fade_s: 0.5 }).unwrap();
     let publisher = follower.publisher();
     let (mut u, mut std, mut flags) = ([0.0; 8], [0.0; 8], [0u8; 8]);
     let mut total = 0;
@@ -56,7 +57,10 @@ fn points_and_blocks_allocate_and_free_nothing() {
         publisher.publish([&first, &jumped, &changed][round % 3]).unwrap();
         let before = CALLS.with(Cell::get);
         // Inside the domain, and outside it with the stand-in.
-        for y in [40.0, 41.0, 45.0, 120.0, -20.0] {
+        for (k, y) in [40.0, 41.0, 45.0, 120.0, -20.0].into_iter().enumerate() {
+            let number = 100 * round as i64 + k as i64;
+            follower.number(number).unwrap();
+            follower.read(&[number - 1], &[y]).unwrap();
             follower.warm(y, 100.0, 0.0).unwrap();
             follower.point(y + 0.01 * round as f64, 100.0, 0.0).unwrap();
         }

@@ -2,7 +2,7 @@
 
 use dehyst::authenticator::{tag, Heard, Question, Sender};
 use dehyst::wire::{samples, Delta, Query, Reply};
-use dehyst::{Authenticator, Follower, Limits, Out, Snapshot, Update};
+use dehyst::{Authenticator, CorrectionSettings, Follower, Limits, Out, Snapshot, Update};
 use std::fs;
 use std::path::PathBuf;
 
@@ -310,6 +310,71 @@ fn points_one_by_one_are_the_block() {
         compared += 1;
     }
     assert!(compared > 15, "{compared}");
+}
+
+#[test]
+fn a_correction_is_that_of_the_follower_of_the_service() {
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    let text = String::from_utf8(read("correction.txt")).unwrap();
+    let head: Vec<&str> = text.lines().next().unwrap().split_whitespace().collect();
+    let [share, mode_hz, fade_s] = [2, 3, 4].map(|at| head[at].parse().unwrap());
+    let mut follower = Follower::new(&read(head[1]), limits).unwrap();
+    follower.correct(CorrectionSettings { share, mode_hz, fade_s }).unwrap();
+    let number = |text: &str| text.parse::<f64>().unwrap();
+    let rows = rows("correction.txt");
+    for row in &rows {
+        let seq: i64 = row[0].parse().unwrap();
+        if row[3] != "-" {
+            follower.publisher().publish(&read(&row[3])).unwrap();
+        }
+        if row[4] != "-" {
+            follower.read(&[row[4].parse().unwrap()], &[number(&row[5])]).unwrap();
+        }
+        follower.number(seq).unwrap();
+        let got = follower.point(number(&row[1]), number(&row[2]), 0.0).unwrap();
+        let correcting = follower.correcting().unwrap();
+        same(&format!("u_V of {seq}"), &[got.u_v], &[number(&row[6])]);
+        same(&format!("correction of {seq}"), &[correcting.integral.u_v], &[number(&row[7])]);
+        let state = (correcting.age, correcting.integral.halved, correcting.integral.doubted);
+        let expected = (row[8].parse().unwrap(), row[9].parse().unwrap(), row[10].parse().unwrap());
+        assert_eq!(state, expected, "{seq}");
+    }
+    assert!(rows.len() >= 1000 && rows.last().unwrap()[9] != "0" && rows.last().unwrap()[10] != "0");
+}
+
+#[test]
+fn what_a_correction_cannot_use_is_refused_and_changes_nothing() {
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    let good = CorrectionSettings { share: 0.02, mode_hz: 200.0, fade_s: 0.05 };
+    let mut follower = Follower::new(&read("lssvm.model.payload"), limits).unwrap();
+    for (field, bad) in [
+        ("share", CorrectionSettings { share: 0.0, ..good }),
+        ("share", CorrectionSettings { share: 1.1, ..good }),
+        ("mode_Hz", CorrectionSettings { mode_hz: f64::NAN, ..good }),
+        ("fade_s", CorrectionSettings { fade_s: -1.0, ..good }),
+    ] {
+        assert_eq!(follower.correct(bad).unwrap_err().field, field);
+        assert!(follower.correcting().is_none());
+    }
+    let endless = Limits { y_max_um: f64::INFINITY, ..limits };
+    assert!(Follower::new(&read("lssvm.model.payload"), endless).unwrap().correct(good).is_err());
+    follower.correct(good).unwrap();
+    assert_eq!(follower.number(-1).unwrap_err().field, "seq");
+    assert_eq!(follower.read(&[1, 2], &[40.0]).unwrap_err().field, "y_um");
+    assert_eq!(follower.read(&[1, 1], &[40.0, 40.0]).unwrap_err().field, "seq[1]");
+    // Switched off, it goes to zero over fade_s, and a point without a number has none.
+    let mut plain = Follower::new(&read("lssvm.model.payload"), limits).unwrap();
+    let mut added = Vec::new();
+    for k in 0..400_i64 {
+        follower.number(k).unwrap();
+        follower.read(&[k - 1], &[39.98]).unwrap();
+        let correcting = follower.correcting().unwrap();
+        correcting.on = k < 300;
+        added.push(follower.point(40.0, 0.0, 0.0).unwrap().u_v - plain.point(40.0, 0.0, 0.0).unwrap().u_v);
+    }
+    assert!(added[299] > 1e-4, "{}", added[299]);
+    assert!(added[325] > 0.0 && added[325] < added[299]);
+    assert_eq!(added[399], 0.0);
 }
 
 const LENGTHS: [(usize, &str); 8] = [
