@@ -10,6 +10,7 @@ the one before is believed until the difference is named: a stage that missed a 
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -17,8 +18,12 @@ import numpy as np
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.query import Pending
 
-#: Largest difference, as a share of the voltage range: rounding by a converter, noise of a voltage that is read back.
-TOLERANCE: Final = 0.01
+#: Largest difference, as a share of the voltage range, whatever a converter rounds and a voltage that is read back
+#: varies by; and the least.
+TOLERANCE, LEAST_TOLERANCE = 0.01, 1e-4
+#: Between the two it is so many standard deviations of the differences so far, over so many samples.
+_SIGMA: Final = 5.0
+_OVER: Final = 500
 #: The voltage of a sample may be that of a neighbour: sender and stage count the instant of a voltage differently.
 _NEIGHBOURS: Final = 1
 #: A sample that differs adds one, one that agrees takes one away. Samples differ from this count on, until it is 0.
@@ -43,7 +48,8 @@ class CommandWitness:
     """
 
     def __init__(self, span_V: float) -> None:
-        self._tolerance_V = TOLERANCE * span_V
+        self._most_V, self._least_V = TOLERANCE * span_V, LEAST_TOLERANCE * span_V
+        self._differences_V2 = (self._most_V / _SIGMA) ** 2
         # Newest last. A tuple that is replaced as a whole: two threads at once may lose a query, and no more.
         self._claims: tuple[Pending, ...] = ()
         self._doubt = 0
@@ -57,6 +63,11 @@ class CommandWitness:
         """Whether a sample has differed lately: such ones teach nothing, so nothing has to be undone later."""
         return self._doubt > 0 and self._credit >= _CREDIT
 
+    @property
+    def tolerance_V(self) -> float:
+        """Difference from what was commanded up to which a voltage agrees, V."""
+        return min(max(_SIGMA * math.sqrt(self._differences_V2), self._least_V), self._most_V)
+
     def note(self, pending: Pending, y_um: FloatArray, u_V: FloatArray) -> None:
         """Keep what a controller has commanded, and the (n,) voltages, V, for ``y_um``, µm, that are its answer."""
         claim = Pending(pending.first, np.concatenate([pending.y_um, y_um]), np.concatenate([pending.u_V, u_V]))
@@ -68,13 +79,14 @@ class CommandWitness:
         None where it is, and where nothing is known.
         """
         known: tuple[float, float] | None = None
+        tolerance_V = self.tolerance_V
         for claim in reversed(self._claims):
             k = seq - claim.first
             if not 0 <= k < claim.u_V.size:
                 continue
             near_V = claim.u_V[max(0, k - _NEIGHBOURS) : k + 1 + _NEIGHBOURS]
-            if near_V.min() - self._tolerance_V <= u_V <= near_V.max() + self._tolerance_V:
-                self._agrees(u_V)
+            if near_V.min() - tolerance_V <= u_V <= near_V.max() + tolerance_V:
+                self._agrees(u_V, float(np.abs(near_V - u_V).min()))
                 return self._stands_in(known, u_V)
             known = known or (float(claim.u_V[k]), float(claim.y_um[k]))
         if known is not None:
@@ -90,12 +102,13 @@ class CommandWitness:
         if known is None or not self.doubts:
             self._shown_V = u_V
             return None
-        held = not self.why and not abs(u_V - self._shown_V) > self._tolerance_V
+        held = not self.why and not abs(u_V - self._shown_V) > self.tolerance_V
         return None if held else known
 
-    def _agrees(self, u_V: float) -> None:
+    def _agrees(self, u_V: float, difference_V: float) -> None:
+        self._differences_V2 += (difference_V**2 - self._differences_V2) / _OVER
         # A stage that holds its place agrees with everybody who has asked for that place.
-        if not abs(u_V - self._moved_V) <= self._tolerance_V:
+        if not abs(u_V - self._moved_V) <= self._most_V:
             self._moved_V = u_V
             self._credit = min(self._credit + 1, _CREDIT)
         self._believe()

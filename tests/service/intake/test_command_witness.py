@@ -75,6 +75,37 @@ def test_a_voltage_that_is_held_is_believed() -> None:
         assert not witness.why
 
 
+def slow_V(seq: int) -> float:
+    """A slow motion, and rest from sample 4000 on."""
+    return 5.0 + 0.5 * math.sin(0.01 * min(seq, 4000))
+
+
+def follow_slowly(shown_V: Callable[[int], float], n: int) -> list[int]:
+    """The samples of ``n`` for which what was commanded stands in."""
+    witness, found = CommandWitness(SPAN_V), []
+    for seq in range(n):
+        if seq % 5 == 0:
+            u_V = np.array([slow_V(k) for k in range(seq, seq + 10)])
+            witness.note(Pending(seq, u_V[:5], u_V[:5]), u_V[5:], u_V[5:])
+        if witness.take(seq, shown_V(seq)) is not None:
+            found.append(seq)
+    return found
+
+
+def test_where_voltages_agree_to_the_last_bit_a_small_difference_is_seen() -> None:
+    """Each sample that is believed teaches the wrong."""
+    found = follow_slowly(lambda seq: slow_V(seq) + (0.002 * SPAN_V if seq >= 3310 else 0.0), 3400)
+    assert found == list(range(3310, 3400))
+
+
+def test_a_noisy_voltage_that_is_read_back_is_believed_in_motion_and_at_rest() -> None:
+    noise_V = 0.002 * SPAN_V * np.random.default_rng(0).normal(size=8000)
+    assert len(follow_slowly(lambda seq: slow_V(seq) + noise_V[seq], 8000)) <= 8
+    # So is a converter of 12 bits.
+    step_V = SPAN_V / 4096
+    assert not follow_slowly(lambda seq: step_V * round(slow_V(seq) / step_V), 8000)
+
+
 def test_a_neighbours_voltage_is_right() -> None:
     """Sender and service may count the instant of a voltage differently by one sample."""
     for by in (-1, 1):
