@@ -87,11 +87,11 @@ class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
     numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
-    dead band of the frame that is served. marks : (B, 2, 1 + p, p) estimates and covariances, see ``MARKS``; ages :
-    when they were made. basis : (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more
-    than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
-    places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
-    `adaptive.online.track.Past`; past_from : voltages written before each; past_voltages : ring of all voltages.
+    dead band of the frame that is served. marks : (B, 2, 1 + p, p) estimates and covariances, see ``MARKS``. basis :
+    (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more than is looked at, so that
+    the last can be taken back. pasts : (B, 2, ...) known places of the stage, the older one first: motion, voltage
+    before, voltages and readings over the lag, memory, as of `adaptive.online.track.Past`; past_from : voltages written
+    before each; past_voltages : ring of all voltages.
     counters : (B, OUTCOMES).
     """
 
@@ -112,7 +112,6 @@ class Rows(NamedTuple):
     beta: FloatArray
     covariance: FloatArray
     marks: FloatArray
-    ages: IntArray
     delay: FloatArray
     domain: FloatArray
     basis: FloatArray
@@ -214,7 +213,7 @@ class FleetState:
         B, state = len(bases), _ordinary(bases[0], config)
         p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
         likes = {name: state[path] for name, path in _ARRAYS.items()} | {
-            "frames": np.zeros(3), "marks": np.zeros((marks, 1 + p, p)), "ages": np.zeros(marks, dtype=np.int64),
+            "frames": np.zeros(3), "marks": np.zeros((marks, 1 + p, p)),
             "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2), "basis": np.zeros(p),
             "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
             "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
@@ -227,7 +226,6 @@ class FleetState:
         self._fields = {path: getattr(s, name) for name, path in _ARRAYS.items()}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j, 0], f"{mark}.covariance": s.marks[:, j, 1:]}
-        self._fields |= {"mark_ages": s.ages}
         parts: dict[str, Any] = {
             "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
             "memory": slice(4 + 2 * lag, None),

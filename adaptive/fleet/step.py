@@ -283,8 +283,8 @@ def _finds_fault(
         return True
     if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
         # A good estimate becomes the next mark; see `Parts.judge`.
-        s.marks[b, 0], s.ages[b, 0] = s.marks[b, 1], s.ages[b, 1]
-        s.marks[b, 1, 0], s.marks[b, 1, 1:], s.ages[b, 1] = s.beta[b], s.covariance[b], j.judged
+        s.marks[b, 0] = s.marks[b, 1]
+        s.marks[b, 1, 0], s.marks[b, 1, 1:] = s.beta[b], s.covariance[b]
         s.known[b, 0], s.known[b, 1] = s.known[b, 1], s.known[b, 2]
     if places:
         if confirmed:

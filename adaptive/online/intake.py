@@ -178,11 +178,6 @@ class Intake:
         return "" if self._trial is None else self._trial.why
 
     @property
-    def tried_by_voltages(self) -> bool:
-        """Whether readings are on trial, and the model may not say where the stage is."""
-        return self._trial is not None and bool(self._trial.by_voltages)
-
-    @property
     def distrusted_s(self) -> float:
         """For how long the readings have been on trial, s; 0 while they are not."""
         return 0.0 if self._trial is None else self._trial.since * self.dt_s

@@ -9,7 +9,6 @@ so that a change is learnt once and the old samples of the window stay valid.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite, sqrt
 from typing import Annotated, Any
@@ -162,35 +161,16 @@ EVENTS = ("fallbacks", "rollbacks", "distrusts", "adoptions", "adoptions_refused
 
 #: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
 #: marked this often, s.
-ROLLBACK_S, MARK_S = 0.5, 1.0
+ROLLBACK_S, MARK_S = 0.5, 0.1
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
 #: Time between two checks of the sensor, s; at least a step of the filter.
 CHECK_S = 0.004
-#: While readings are on trial, the identified model is served if its recent rms error is below ``MOVES`` times the
-#: recent motion of the estimate, and below this share of the span. An estimate that hardly moves is far better than
-#: the identified model. One that moved much may have followed a real change of the stage; the share covers that case.
-#: The error of the last estimate during a trial was 0.2 to 8 times its motion before (16 foreign stages).
-MOVES, ALONE_SHARE = 5.0, 0.02
-#: Shares of the range at which the motion of the estimate is taken, in both directions.
-COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
-
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
 #: Largest move of the output at an adoption, in its stated standard deviations (rms over the newest samples).
 MOST_MOVED = 2.0
-
-
-def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float = 0.0) -> FloatArray:
-    """(n, p) basis at ``shares`` of the range, each reached from rest in one stroke and passed with ``v_um_per_s``."""
-    rows, kernel = np.empty((len(shares), features.basis_size)), np.empty(features.kernel_size)
-    for row, share in zip(rows, shares, strict=True):
-        y_um = features.offset_um + features.gain * (
-            features.y_min_um + share * (features.y_max_um - features.y_min_um)
-        )
-        features.fill(y_um, v_um_per_s, 0.0, features.rest_memory(y_um), row, kernel)
-    return rows
 
 
 class Parts:
@@ -214,10 +194,6 @@ class Parts:
     # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
-    mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
-    alone: Annotated[bool, Entry("whether the identified model is served because readings are on trial")]
-    moved_V: Annotated[float, Entry("how far the estimate had moved before that trial, rms", "V", low=0.0)]
-    moved_s: Annotated[float, Entry("within what time", "s", low=1e-9)]
 
     def __init__(
         self,
@@ -236,7 +212,6 @@ class Parts:
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark = self.filter.mark()
         self.next_mark = self.mark
-        self.mark_ages = (0, 0)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
@@ -249,10 +224,6 @@ class Parts:
         if allowed_V is None:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.allowed_V = allowed_V
-        v = base.features.v_scale_um_per_s
-        self.rows = np.concatenate([basis_over(base.features, COMPARED, way * v) for way in (-1.0, 1.0)])
-        self.alone = False
-        self.moved_V, self.moved_s = 0.0, MARK_S
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
 
@@ -313,27 +284,10 @@ class Parts:
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
             self.intake.mark_rates()
-            self.mark_ages = (self.mark_ages[1], j.judged)
-
-    def watch_trial(self) -> bool:
-        """Update ``alone`` after a sample; returns whether it has changed."""
-        on_trial_s, before = self.intake.distrusted_s, self.alone
-        if on_trial_s or before:
-            limit_V = MOVES * self.moved_V * max(1.0, on_trial_s / self.moved_s)
-            limit_V = min(limit_V, ALONE_SHARE * self.filter.span_V)
-            known = self.judgement.frozen_V2 <= limit_V * limit_V
-            # A model that may not judge the sensor has confirmed no reading, and so no estimate.
-            self.alone = on_trial_s > 0.0 and (known or self.intake.tried_by_voltages)
-        if self.alone and not before:
-            self.intake.reckon_by(self.intake.base)
-        return self.alone != before
 
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
-        move_V = self.rows @ (self.next_mark.beta - self.mark.beta)
-        self.moved_V = sqrt(float(np.mean(move_V**2)))
-        self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s
         self.window.keep()
         self.events["distrusts"] += 1
 
@@ -347,7 +301,6 @@ class Parts:
     def _mark_now(self) -> None:
         """The present estimate is the one to return to."""
         self.mark = self.next_mark = self.filter.mark()
-        self.mark_ages = (self.judgement.judged,) * 2
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -382,7 +335,7 @@ class Parts:
         base = self.intake.base
         j, window, seq = self.judgement, self.window, self.intake.gates.seq
         valid = j.valid and not self.intake.fault
-        if j.fallback or self.alone:
+        if j.fallback:
             return replace(base, noise_variance=j.frozen_short_V2 + self.missing_V2, seq=seq, valid=valid)
         support, alpha, bias = window.arrays()
         beta = self.filter.beta
@@ -435,7 +388,7 @@ class Parts:
     @property
     def ordinary(self) -> bool:
         """Whether samples are learnt in the ordinary way: nothing is in doubt, and nothing is being repaired."""
-        return self.intake.ordinary and not (self.window.heals or self.alone)
+        return self.intake.ordinary and not self.window.heals
 
     # ---- keeping
 
@@ -558,10 +511,7 @@ class Learner:
             if intake.track is not None and intake.track.features is intake.track.served:
                 parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
         moved = taken.jump_um or taken.distrusted or taken.renamed
-        # An ordinary sample neither begins nor ends a trial of the sensor.
-        if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
-            self._cache = None
-        if taken.refused == admission.GAP:
+        if moved or taken.refused == admission.GAP:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
@@ -677,7 +627,7 @@ class Learner:
     def moving(self) -> MovingPart | None:
         """What has moved since the last snapshot; None where something else than the learnt model is served."""
         parts, intake, j = self.parts, self.parts.intake, self.parts.judgement
-        if j.fallback or parts.alone or intake.track is None or self.trouble or self.distrusts:
+        if j.fallback or intake.track is None or self.trouble or self.distrusts:
             return None
         frame = intake.served
         return MovingPart(
