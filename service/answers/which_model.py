@@ -362,7 +362,7 @@ ROWS: Final = (
     Row(Answering.IDENTIFIED, "the default model does not learn", lambda s: not s.learns),
     Row(
         Answering.IDENTIFIED,
-        "the identified model predicts better, or the readings are on trial",
+        "the identified model predicts better",
         lambda s: s.identified,
     ),
     Row(
