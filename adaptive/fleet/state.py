@@ -20,7 +20,7 @@ from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.dead_reckoning import answers, drive_V, mean_slope
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
-from dehyst.adaptive.online.learner import MARK_S, Learner
+from dehyst.adaptive.online.learner import MARK_S, REFERENCE_S, Learner
 from dehyst.adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, parted
 
 #: Results of a sample, by their number in a fleet.
@@ -34,7 +34,7 @@ _ARRAYS: Final = {
     "drive_ring": "front.track.drive.ring", "voltages": "front.track.u_V",
     "rates": "front.track.rates", "known": "front.known", "readings": "front.track.y_um", "good": "front.track.good",
     "motion": "front.track.motion", "memory": "front.track.memory",
-    "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta",
+    "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta", "references": "references",
     "covariance": "filter.covariance", "domain": "domain", "point": "point", "born": "window.born",
 }  # fmt: skip
 #: Numbers of an ordinary learner that are the same as others.
@@ -112,6 +112,7 @@ class Rows(NamedTuple):
     beta: FloatArray
     covariance: FloatArray
     marks: FloatArray
+    references: FloatArray
     delay: FloatArray
     domain: FloatArray
     basis: FloatArray
@@ -166,7 +167,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
-             "mark_every": max(1, round(MARK_S / step_s)), "window_every": config.window_every,
+             "mark_every": max(1, round(MARK_S / step_s)), "reference_every": max(1, round(REFERENCE_S / step_s)),
+             "window_every": config.window_every,
              "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape

@@ -271,7 +271,7 @@ def _finds_fault(
         follows, fastest_V_per_s = r.front.following, config.envelope.drift_per_s * f.drive_V
         known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
         judges = known and r.front.credit > 0
-        p_V = u - target + dot(h, s.marks[b, 0, 0], p)
+        p_V = u - target + dot(h, s.references[b, 0], p)
         odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
         if not known:
             _forget_slopes(follows)
@@ -281,10 +281,13 @@ def _finds_fault(
         places = confirmed or (not judges and follows.steps == 0 and follows.still == 0)
     if fault:
         return True
-    if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
-        # A good estimate becomes the next mark; see `Parts.judge`.
+    # A good estimate becomes the next mark, and the next reference; see `Parts.judge`.
+    good = j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2
+    if good and j.judged % config.mark_every == 0:
         s.marks[b, 0] = s.marks[b, 1]
         s.marks[b, 1, 0], s.marks[b, 1, 1:] = s.beta[b], s.covariance[b]
+    if good and j.judged % config.reference_every == 0:
+        s.references[b, 0], s.references[b, 1] = s.references[b, 1], s.beta[b]
         s.known[b, 0], s.known[b, 1] = s.known[b, 1], s.known[b, 2]
     if places:
         if confirmed:

@@ -160,8 +160,9 @@ class Delay:
 EVENTS = ("fallbacks", "rollbacks", "distrusts", "adoptions", "adoptions_refused")
 
 #: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
-#: marked this often, s.
-ROLLBACK_S, MARK_S = 0.5, 0.1
+#: marked this often, s. The readings are judged by one that is older, between one and two such times: a newer one has
+#: already taken in a part of what has begun to go wrong.
+ROLLBACK_S, MARK_S, REFERENCE_S = 0.5, 0.1, 1.0
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
@@ -194,6 +195,7 @@ class Parts:
     # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
+    references: Annotated[FloatArray, Entry("good estimates that judge the readings, the older first", "V", "2,p")]
 
     def __init__(
         self,
@@ -212,6 +214,7 @@ class Parts:
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark = self.filter.mark()
         self.next_mark = self.mark
+        self.references = np.stack([base.beta, base.beta])
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
@@ -280,10 +283,14 @@ class Parts:
             self.filter.go_back(self.mark)
             # If that estimate does not end it either, the next to return to is the identified one.
             self.mark = self.next_mark = self.first
+            self.references[:] = self.first.beta
             self.events["rollbacks"] += 1
-        elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
-            self.mark, self.next_mark = self.next_mark, self.filter.mark()
-            self.intake.mark_rates()
+        elif j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
+            if j.judged % max(1, round(MARK_S / step_s)) == 0:
+                self.mark, self.next_mark = self.next_mark, self.filter.mark()
+            if j.judged % max(1, round(REFERENCE_S / step_s)) == 0:
+                self.references[0], self.references[1] = self.references[1], self.filter.beta
+                self.intake.mark_rates()
 
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
@@ -301,6 +308,7 @@ class Parts:
     def _mark_now(self) -> None:
         """The present estimate is the one to return to."""
         self.mark = self.next_mark = self.filter.mark()
+        self.references[:] = self.mark.beta
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -317,6 +325,7 @@ class Parts:
         marks = (self.mark, self.next_mark)
         for beta, _ in {id(m): m for m in marks}.values():
             beta[0] += by_V
+        self.references[:, 0] += by_V
         self.delay.shift(by_V)
 
     @property
@@ -584,7 +593,7 @@ class Learner:
         """Check the sensor. Returns the gate that forbids learning, or ""."""
         parts, intake = self.parts, self.parts.intake
         kernel_V = pair.u_V - target_V
-        p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
+        p_V = kernel_V + float(self._basis.dot(parts.references[0]))
         if saturated or not intake.follow(pair, p_V, parts.check_s):
             return ""
         if not intake.distrust(self.snapshot):
