@@ -158,7 +158,7 @@ def _described(kind: type) -> dict[str, str]:
     found: dict[str, str] = {}
     ends = [mark.start() for mark in marks[1:]] + [len(text)]
     for mark, end in zip(marks, ends, strict=False):
-        meaning = text[mark.end() : end].strip().rstrip(".")
+        meaning = text[mark.end() : end].partition(" Raises ")[0].strip().rstrip(".;")
         found |= dict.fromkeys(mark[1].split(", "), meaning)
     return found
 
