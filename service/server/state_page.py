@@ -34,8 +34,8 @@ does not fit is refused; the message names the entry, what was got and what was 
 older checkpoint or from its model file.
 
 *Value* is shape, unit and range. p: inputs of the linear part, d: of the kernel, m: doubles of the hysteresis memory,
-N: samples of the window; any other name, and `*`, is a length of that entry. Numbers are finite unless stated. An entry
-is listed once, in the first table that has it. The entries of a stored model are those of its
+N: samples of the window; any other name, and `*`, is a length of that entry. NaN: may be not finite. An entry is listed
+once, in the first table that has it. The entries of a stored model are those of its
 [payload](protocol.md#evaluating-a-model).
 """
 #: Title of each table, where its entries are, and who declares them.
