@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from enum import Enum, StrEnum
+from itertools import groupby
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
@@ -439,9 +440,9 @@ def page() -> str:
         models="\n".join(f"| `{answers}` | {text} |" for answers, text in MODELS.items()),
         rows="\n".join(f"| {row.when} | `{row.answers}` |" for row in ROWS),
         rules="\n".join(
-            f"| {f'`{name}`' if name else 'none'} | `{rule.answers}` | {rule.kept.value} | {says[rule.teaches]} "
-            f"| {says[rule.returns]} |"
-            for name, rule in RULES.items()
+            f"| {', '.join(f'`{name}`' if name else 'none' for name in names)} | `{rule.answers}` | {rule.kept.value} "
+            f"| {says[rule.teaches]} | {says[rule.returns]} |"
+            for rule, names in groupby(RULES, key=RULES.__getitem__)
         ),
     )
 

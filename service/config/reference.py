@@ -9,7 +9,9 @@ import json
 import math
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import MISSING, is_dataclass
+from itertools import groupby
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin
@@ -84,15 +86,23 @@ def _rows(kind: type, prefix: str) -> list[str]:
     """The rows of one table; nested tables follow with dotted names."""
     described = _described(kind)
     head = ["| key | default | values | meaning |", "|---|---|---|---|"] if not prefix else []
-    rows, nested = [], []
+    rows, nested = list[tuple[str, ...]](), list[str]()
     for key in _flat(kind):
         if isinstance(key.type, type) and is_dataclass(key.type) and key.type not in _OWN_TABLES:
             nested += _rows(key.type, f"{prefix}{key.name}.")
         else:
             meaning = key.setting.help or described.get(key.name, "")
-            cells = (f"`{prefix}{key.name}`", _default(key), _values(key), meaning)
-            rows.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
-    return [*head, *rows, *nested, *([] if prefix else [""])]
+            rows.append((f"`{prefix}{key.name}`", _default(key), _values(key), meaning))
+    return [*head, *_lines(rows), *nested, *([] if prefix else [""])]
+
+
+def _lines(rows: list[tuple[str, ...]]) -> Iterator[str]:
+    """The rows as lines; neighbours that are described together are one."""
+    for _, group in groupby(rows, key=lambda row: row[3] or row[0]):
+        columns = list(zip(*group, strict=True))
+        same = [column[:1] if len(set(column)) == 1 else column for column in columns]
+        cells = [", ".join(cell or "none" for cell in column) if len(column) > 1 else column[0] for column in same]
+        yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def _flat(kind: type) -> list[Key]:
@@ -148,7 +158,7 @@ def _described(kind: type) -> dict[str, str]:
     found: dict[str, str] = {}
     ends = [mark.start() for mark in marks[1:]] + [len(text)]
     for mark, end in zip(marks, ends, strict=False):
-        meaning = text[mark.end() : end].strip().rstrip(".")
+        meaning = text[mark.end() : end].partition(" Raises ")[0].strip().rstrip(".;")
         found |= dict.fromkeys(mark[1].split(", "), meaning)
     return found
 
