@@ -8,7 +8,7 @@ blocks that were not used for its numbers. The model is frozen, so no learning c
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -122,10 +122,7 @@ def regression_of(
         kept = np.flatnonzero(keep)
     common, r = np.vstack(shared), np.concatenate(targets)
     now = np.concatenate(marks)
-    causes = [
-        ChangeCause(c.name, c.alternatives, c.numbers, c.least, np.vstack([rows[0][i], rows[1][i]]))
-        for i, c in enumerate(found)
-    ]
+    causes = [replace(c, columns=np.vstack([rows[0][i], rows[1][i]])) for i, c in enumerate(found)]
     # A mains line is searched for in the residual of the recent stretch.
     left = np.zeros(recent.u_V.size)
     left[kept] = (r - common @ solve_scaled(common, r))[now]
@@ -133,7 +130,7 @@ def regression_of(
     if line is not None:
         columns = np.zeros((r.size, 2))
         columns[now] = line.columns[kept]
-        causes.append(ChangeCause(line.name, (), line.numbers, 0.0, columns))
+        causes.append(replace(line, columns=columns))
     return ChangeRegression(r, common, tuple(causes), np.concatenate(blocks), now), common
 
 

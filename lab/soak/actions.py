@@ -16,7 +16,7 @@ import numpy as np
 import zenoh
 
 from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, dwell_key
-from dehyst.lab.soak.fault_plan import PlannedFault
+from dehyst.lab.soak.fault_plan import CHANGES, PlannedFault
 from dehyst.lab.soak.observed import Monitor
 from dehyst.lab.soak.rig import SERVICES, SoakRig
 from dehyst.lab.testbed.shifted_clock import write_offset
@@ -29,8 +29,6 @@ from dehyst.service.stage_node.faults import DELIVERY, READING, fault_key
 _DISK_FULL_BYTES: Final = 4096
 #: A service can take over if its status, and the newest sample in it, are not older than this, s.
 _BEHIND_S: Final = 3.0
-#: Faults whose name in the stage's protocol differs.
-_STAGE_NAMES: Final = {"stage_clock": "clock"}
 #: A process that was killed is started again after this time, s.
 _RESTART_S: Final = 1.0
 
@@ -76,8 +74,9 @@ class FaultActions:
         self._disturbers = 0
         #: What begins each kind: it returns None if nothing is to be undone.
         self._kinds: dict[str, Callable[[PlannedFault], Course | None]] = {
-            "gain": lambda fault: self._tell_stage("change", values={"gain_drift.gain": fault.value}),
-            "payload": lambda fault: self._tell_stage("change", values={"resonance.payload_ratio": fault.value}),
+            **dict.fromkeys(
+                CHANGES, lambda fault: self._tell_stage("change", values={CHANGES[fault.kind]: fault.value})
+            ),
             "dwell": self._dwell,
             "kill_primary": lambda _: self._kill_service(self.primary),
             "kill_standby": lambda _: self._kill_service(next(name for name in SERVICES if name != self.primary)),
@@ -94,7 +93,7 @@ class FaultActions:
             "rogue_claim": lambda fault: self._strange(fault, "claim"),
             "folder_removed": lambda _: self._take_folders_away(),
             "freeze_restart": lambda _: self._freeze_and_kill(),
-            **dict.fromkeys((*READING, *DELIVERY, *_STAGE_NAMES), self._disturb_samples),
+            **dict.fromkeys((*READING, *DELIVERY, "stage_clock"), self._disturb_samples),
         }
 
     def begin(self, fault: PlannedFault) -> None:
@@ -151,9 +150,7 @@ class FaultActions:
 
     def _disturb_samples(self, fault: PlannedFault) -> None:
         task = self._soak.task
-        share = {"saturate": 0.5, "other_stage": 1.0}.get(fault.kind, 0.0)
-        value = share * (task.low_um + task.high_um) or fault.value
-        name = _STAGE_NAMES.get(fault.kind, fault.kind)
+        name, value = fault.for_stage(task.low_um, task.high_um)
         self._tell_stage(name, duration_s=max(fault.duration_s, task.dt_s), value=value)
 
     def _dwell(self, fault: PlannedFault) -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
@@ -32,7 +31,8 @@ from dehyst.service.runtime.stopping import StopSignal
 from dehyst.service.security.authenticator import own_authenticator
 from dehyst.service.security.lease import CommandLease
 from dehyst.service.stage_node.node import status_key
-from dehyst.sim.signals.references import DemoReference
+from dehyst.sim.signals.references import BLEND_S, DemoReference, Motion, Reference, Sequenced, Tones, blended
+from dehyst.sim.signals.voltages import sample_times
 
 # --- The task of the soak's controller: keys, limits, and the reference.
 
@@ -84,36 +84,13 @@ class ControlTask:
 # --- The reference
 
 PERIOD_S = 120.0
-#: Time of the transition between motion and rest, s.
-FADE_S = 0.6
-
-
-def _rest(k: NDArray[np.int64], start: int, stop: int, width: float) -> FloatArray:
-    """(3, n) weight of the motion with a rest from ``start`` to ``stop``, and its two derivatives per tick.
-
-    Both transitions are steps of seventh order, ``width`` ticks long, and lie inside.
-    """
-    leaves = k < 0.5 * (start + stop)
-    q = np.clip(np.where(leaves, (k - start) / width, (k - stop) / width + 1.0), 0.0, 1.0)
-    s0 = q**4 * (35.0 - 84.0 * q + 70.0 * q**2 - 20.0 * q**3)
-    s1 = 140.0 * q**3 * (1.0 - q) ** 3
-    s2 = 420.0 * q**2 * (1.0 - q) ** 2 * (1.0 - 2.0 * q)
-    sign = np.where(leaves, -1.0, 1.0)
-    return np.stack((np.where(leaves, 1.0 - s0, s0), sign * s1 / width, sign * s2 / width**2))
-
-
-def _towards(motion: FloatArray, level_um: float, weight: FloatArray, dt_s: float) -> FloatArray:
-    """(3, n) motion about a level, scaled by a weight with its derivatives per tick (product rule)."""
-    w0, w1, w2 = weight[0], weight[1] / dt_s, weight[2] / dt_s**2
-    y, v, a = motion[0] - level_um, motion[1], motion[2]
-    return np.stack((level_um + w0 * y, w0 * v + w1 * y, w0 * a + 2.0 * w1 * v + w2 * y))
 
 
 @dataclass
 class SoakReference:
     """A periodic reference: rows y µm, v µm/s, a µm/s² by tick. Each period begins and ends at rest at ``low_um``.
 
-    ``dwells`` are pairs (first tick, ticks) during which the reference rests at mid-range.
+    ``dwells`` are pairs (first tick, ticks) during which the reference rests at mid-range, blends included.
     """
 
     dt_s: float
@@ -123,23 +100,26 @@ class SoakReference:
     dwells: list[tuple[int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        n = round(PERIOD_S / self.dt_s)
-        t_s = np.arange(n).astype(np.float64) * self.dt_s
-        made = DemoReference(PERIOD_S, self.low_um, self.high_um, self.seed).at(t_s)
-        motion = np.stack((made.y_um, made.v_um_per_s, made.a_um_per_s2))
-        # It moves where one that rests all the time would leave its motion.
-        turn = np.array([[1.0], [0.0], [0.0]]) - _rest(np.arange(n), 0, n - 1, FADE_S / self.dt_s)
-        self._motion = _towards(motion, self.low_um, turn, self.dt_s)
+        moving = DemoReference(PERIOD_S, self.low_um, self.high_um, self.seed)
+        period = Sequenced(((PERIOD_S - 2.0 * BLEND_S, moving), (PERIOD_S, Tones(self.low_um))))
+        self._motion = _rows(period.at(sample_times(PERIOD_S, self.dt_s)))
+
+    def at(self, t_s: FloatArray) -> Reference:
+        """The periodic motion at the times ``t_s`` (n,) s of ticks, without dwells."""
+        k = np.rint(t_s / self.dt_s).astype(np.int64)
+        return Reference(t_s, *self._motion[:, k % self._motion.shape[1]])
 
     def rows(self, first: int, n: int) -> FloatArray:
         """(3, n) from tick ``first`` on."""
-        k = np.arange(first, first + n)
-        motion = self._motion[:, k % self._motion.shape[1]]
-        middle = 0.5 * (self.low_um + self.high_um)
+        parts: list[tuple[float, Motion]] = []
         for start, ticks in self.dwells:
-            if start <= k[-1] and k[0] <= start + ticks:
-                motion = _towards(motion, middle, _rest(k, start, start + ticks, FADE_S / self.dt_s), self.dt_s)
-        return motion
+            parts.append((start * self.dt_s + 0.5 * BLEND_S, self))
+            parts.append(((start + ticks) * self.dt_s - 0.5 * BLEND_S, Tones(0.5 * (self.low_um + self.high_um))))
+        return _rows(blended(np.arange(first, first + n, dtype=np.float64) * self.dt_s, [*parts, (math.inf, self)]))
+
+
+def _rows(reference: Reference) -> FloatArray:
+    return np.stack((reference.y_um, reference.v_um_per_s, reference.a_um_per_s2))
 
 
 #: Timeout of a query, s. The controller asks 60 ms ahead, so it does not wait longer.

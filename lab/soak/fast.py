@@ -12,7 +12,7 @@ import numpy as np
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.loop import Asker, turns
 from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, ControlTask, SoakReference
-from dehyst.lab.soak.fault_plan import FAULT_KINDS, PlannedFault, SoakPlan
+from dehyst.lab.soak.fault_plan import CHANGES, FAULT_KINDS, PlannedFault, SoakPlan
 from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
 from dehyst.lab.soak.live import progress_line
 from dehyst.lab.soak.observed import Counted, FaultRecord, Observations, SampleTracker, troubles_since
@@ -27,7 +27,6 @@ from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.stage import Stage
 
 _PROGRESS_S: Final = 5.0
-_CHANGES: Final = {"gain": "gain_drift.gain", "payload": "resonance.payload_ratio"}
 
 
 def run_fast(
@@ -104,14 +103,13 @@ class _Plant:
     def begin_fault(self, fault: PlannedFault) -> None:
         """Begin a fault."""
         c = self._control
-        if fault.kind in _CHANGES:
-            self.injector.add(Fault(CHANGE, values=((_CHANGES[fault.kind], fault.value),)))
+        if fault.kind in CHANGES:
+            self.injector.add(Fault(CHANGE, values=((CHANGES[fault.kind], fault.value),)))
         elif fault.kind == "dwell":
             self.reference.dwells.append((self.k + round(0.3 / c.dt_s), round(fault.duration_s / c.dt_s)))
         else:
-            value = {"saturate": 0.5, "other_stage": 1.0}.get(fault.kind, 0.0) * (c.low_um + c.high_um) or fault.value
-            kind = "clock" if fault.kind == "stage_clock" else fault.kind
-            self.injector.add(Fault(kind, max(fault.duration_s, c.dt_s), value))
+            name, value = fault.for_stage(c.low_um, c.high_um)
+            self.injector.add(Fault(name, max(fault.duration_s, c.dt_s), value))
 
     def command(self, block: int, y_um: FloatArray, u_V: FloatArray) -> None:
         """Take the (n,) voltages of a block for its reference."""

@@ -83,6 +83,12 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
 }
 
 
+#: Faults that change a parameter of the stage, and its name.
+CHANGES: Final = {"gain": "gain_drift.gain", "payload": "resonance.payload_ratio"}
+#: Faults of the readings whose value is a place: the share of the way between the ends of the reference, twice.
+_PLACES: Final = {"saturate": 0.5, "other_stage": 1.0}
+
+
 # --- The plan
 
 #: Time without faults before the first one and at the end, s, and range of the time between two, s.
@@ -112,6 +118,11 @@ class PlannedFault:
     def window_s(self) -> tuple[float, float]:
         """From its beginning to the end of its recovery time, s."""
         return self.at_s, self.end_s + FAULT_KINDS[self.kind].recover_s
+
+    def for_stage(self, low_um: float, high_um: float) -> tuple[str, float]:
+        """Name and value of a fault of the samples in the stage's protocol; the ends are those of the reference."""
+        name = "clock" if self.kind == "stage_clock" else self.kind
+        return name, _PLACES.get(self.kind, 0.0) * (low_um + high_um) or self.value
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,8 +142,7 @@ WARM_UP_S, COMPARED_S = 180.0, 300.0
 _BLOCK_BYTES: Final = 100.0
 #: Samples that may be on their way when two counters are read: a message or two.
 UNDER_WAY = 64
-#: After these faults another service takes over; in these, commands may reach neither the monitor nor the stage.
-_TAKEOVERS: Final = ("kill_primary", "stop_primary")
+#: In these faults commands may reach neither the monitor nor the stage.
 _UNSEEN: Final = ("restart_router",)
 
 
@@ -161,7 +160,7 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
             "voltage beyond its limits, as sent or as applied",
         ),
         "voltages_within_slew": _at_most(
-            _worst_step(observed, seconds), ROUND_OFF, "limits",
+            _worst_step(observed), ROUND_OFF, "limits",
             "largest step of the voltage, as sent or as applied, over what the slew limit allows",
         ),
         "answers_safe": _at_most(
@@ -170,11 +169,6 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
         ),
     }  # fmt: skip
     if not observed.fast:
-        takeovers = [fault.window_s for fault in faults if fault.kind in _TAKEOVERS]
-        around = [s for begin, end in takeovers for s in between(observed.seconds, begin - 1.0, end)]
-        found["takeover_continuous"] = _at_most(
-            _worst_step(observed, around), ROUND_OFF, "limits", "the same, around a take-over"
-        )
         found |= _times(observed)
     found["recovers_by_itself"] = _recovers(observed)
     found["faults_happened"] = _at_most(
@@ -196,11 +190,11 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
     return found
 
 
-def _worst_step(observed: Observations, seconds: Iterable[SampleSecond]) -> float:
+def _worst_step(observed: Observations) -> float:
     """Largest step as a share of what the slew limit allows."""
     unseen = [fault.window_s for fault in observed.faults if fault.kind in _UNSEEN]
     worst_V = 0.0
-    for s in seconds:
+    for s in observed.seconds:
         judged = not any(begin - 1.0 <= s.t_s <= end for begin, end in unseen)
         worst_V = max(worst_V, s.step_V, s.resumed_V if judged else 0.0)
     return worst_V / observed.step_limit_V

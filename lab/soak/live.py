@@ -14,6 +14,7 @@ from dehyst.lab.soak.fault_plan import FAULT_KINDS, PlannedFault, Schedule, Soak
 from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
 from dehyst.lab.soak.observed import Counted, FaultRecord, Monitor, Observations, QuerySecond
 from dehyst.lab.soak.rig import SERVICES, SoakRig
+from dehyst.lab.testbed.identified_stage import Rig
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.sim.stage.config import StageConfig
 
@@ -35,7 +36,8 @@ def run_live(
 
     Raises ServiceError if the processes do not start.
     """
-    with SoakRig(out, stage, task, out / "model.npz") as soak:
+    with Rig(out / "logs") as rig:
+        soak = SoakRig(rig, out, stage, task, out / "model.npz")
         say("      starting router, services, stage, controller, prober, viewer")
         soak.start()
         monitor = Monitor(soak.rig.endpoint, task, time.monotonic())

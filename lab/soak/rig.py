@@ -7,7 +7,6 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 from dehyst.lab.soak.controller import AXIS, SERVED, STAGE, ControlTask
@@ -63,13 +62,13 @@ class SoakRig:
 
     Parameters
     ----------
-    out : folder of the run; logs, configurations and recordings go below it.
+    rig : starts the processes. out : folder of the run; configurations and recordings go below it.
     stage : the simulated stage. task : of the controller. model : file of the identified models.
     """
 
-    def __init__(self, out: Path, stage: StageConfig, task: ControlTask, model: Path) -> None:
+    def __init__(self, rig: Rig, out: Path, stage: StageConfig, task: ControlTask, model: Path) -> None:
         self.task = task
-        self.rig = Rig(out / "logs")
+        self.rig = rig
         self.wall_clock = self.rig.logs / "clock.bin"
         self.model = model
         self._out, self._stage = out, stage
@@ -89,14 +88,6 @@ class SoakRig:
                 "checkpoints": out / name / "checkpoints",
             }
             write_service_config(self._service_file(name), STAGE, axis, connect=[self.rig.endpoint])
-
-    def __enter__(self) -> SoakRig:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.rig.__exit__(kind, error, trace)
 
     @property
     def children(self) -> dict[str, Child]:

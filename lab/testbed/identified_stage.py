@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 from dehyst.adaptive.errors import InputError, NumericsError
@@ -87,7 +86,7 @@ READY_S: Final = 60.0
 SAMPLES_PER_MESSAGE: Final = 5
 
 
-class Rig:
+class Rig(Children):
     """Processes on loopback; use as a context manager.
 
     Attributes
@@ -97,20 +96,11 @@ class Rig:
     """
 
     def __init__(self, logs: Path) -> None:
-        self.logs = logs
+        super().__init__(logs)
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.children: dict[str, Child] = {}
         self._ready: dict[str, str] = {}
         self._starts: dict[str, int] = {}
-        self._all = Children(logs)
-
-    def __enter__(self) -> Rig:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._all.__exit__(kind, error, trace)
 
     def start(self, name: str, arguments: list[str], *, ready: str = READY, wait: bool = True) -> Child:
         """Start ``python ARGUMENTS`` under ``name``; with ``wait`` return when it has printed ``ready``.
@@ -118,7 +108,7 @@ class Rig:
         Raises ServiceError if it does not get ready within ``READY_S``.
         """
         self._starts[name] = self._starts.get(name, 0) + 1
-        child = self._all.start(f"{name}-{self._starts[name]}", arguments)
+        child = super().start(f"{name}-{self._starts[name]}", arguments)
         self.children[name], self._ready[name] = child, ready
         if wait:
             self.wait_ready(name)

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import zenoh
 
@@ -154,19 +154,19 @@ class Children:
     """All child processes of a run. Leaving the block stops them, the last one started first."""
 
     def __init__(self, logs: Path) -> None:
-        self._logs = logs
+        self.logs = logs
         self._children: list[Child] = []
         logs.mkdir(parents=True, exist_ok=True)
 
     def start(self, name: str, arguments: list[str]) -> Child:
         """Start ``python ARGUMENTS``; its standard error goes to ``NAME.log``."""
         with unbroken():
-            child = Child(name, arguments, self._logs / f"{name}.log")
+            child = Child(name, arguments, self.logs / f"{name}.log")
             self._children = [other for other in self._children if other.running]
             self._children.append(child)
         return child
 
-    def __enter__(self) -> Children:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

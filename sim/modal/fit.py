@@ -86,10 +86,8 @@ class ModalFit:
 
     def interval(self, row: int, amplitude_V: float) -> float:
         """Half width of the 95 % interval of a row of ``theta`` at an amplitude (a logarithm: a relative width)."""
-        return self._half_width(row, powers_of(self.model.position(amplitude_V), self.model.degree))
-
-    def _half_width(self, row: int, direction: FloatArray) -> float:
         size = self.model.degree + 1
+        direction = powers_of(self.model.position(amplitude_V), self.model.degree)
         part = self.covariance[row * size : (row + 1) * size, row * size : (row + 1) * size]
         return QUANTILE_95 * float(np.sqrt(max(0.0, float(direction @ part @ direction))))
 

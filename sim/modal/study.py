@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +28,8 @@ SAME_AMPLITUDE: Final = 0.02
 MOST_DAMPING: Final = 0.1
 #: ... and moves an output by at least this share of the output's rms.
 LEAST_SHARE: Final = 0.01
+#: What changes with the amplitude, as `Mode` names it; each with its half width.
+CHANGES: Final = ("frequency_change", "damping_change", "damping_rise_over_softening")
 #: A change is named where it is this many times as large as half of its 95 % interval: many modes are looked at.
 CLEAR: Final = 2.0
 #: Rise of the damping ratio over the relative fall of the frequency, for a loop of Rayleigh's kind in the stiffness:
@@ -46,7 +48,8 @@ class Mode:
     frequency_change, frequency_change_half : relative change from the lowest to the highest amplitude.
     damping_change, damping_change_half : change of the damping ratio.
     gain_change : relative change of the residues' norm.
-    ratio, ratio_half : rise of the damping over the relative fall of the frequency; nan for a single amplitude.
+    damping_rise_over_softening, damping_rise_over_softening_half : rise of the damping over the relative fall of the
+        frequency; nan for a single amplitude.
     error_share : rise of the held-out error, relative, if this mode's frequency and damping were held at those of the
         middle amplitude and all residues fitted again; 0 for a single amplitude.
     finding : ``steady``; ``damping`` where only that changes; ``softens``, ``stiffens``; ``loop inside the mode`` where
@@ -64,8 +67,8 @@ class Mode:
     damping_change: float
     damping_change_half: float
     gain_change: float
-    ratio: float
-    ratio_half: float
+    damping_rise_over_softening: float
+    damping_rise_over_softening_half: float
     error_share: float
     finding: str
 
@@ -91,8 +94,8 @@ class Mode:
             "loop inside the mode": ": as a hysteresis loop in its stiffness does",
             "softens elastically": ": the loss does not grow with it, as it would with a loop in its stiffness",
         }.get(self.finding, "")
-        if self.finding == "softens" and self.ratio_half < 0.5 * RAYLEIGH_RATIO:
-            share = 100.0 * self.ratio / RAYLEIGH_RATIO
+        if self.finding == "softens" and self.damping_rise_over_softening_half < 0.5 * RAYLEIGH_RATIO:
+            share = 100.0 * self.damping_rise_over_softening / RAYLEIGH_RATIO
             kind = f": {share:.2g} % of the loss that a loop of this softening brings"
         return f"{text}{kind}. Held constant, the held-out error rises by {100.0 * self.error_share:.2g} %."
 
@@ -134,7 +137,7 @@ class ModalStudy:
             "converged": self.fit.converged,
             "cost_per_equation": self.fit.cost / self.fit.equations,
             "levels": [_level_dict(level) for level in self.levels],
-            "modes": [_mode_dict(mode) for mode in self.modes],
+            "modes": [{f.name: _json(getattr(mode, f.name)) for f in fields(mode)} for mode in self.modes],
             "notes": list(self.notes),
         }
 
@@ -258,7 +261,7 @@ def _modes(fit: ModalFit, responses: Sequence[FrequencyResponse], levels: Sequen
         if not inside or damping[i].max() > MOST_DAMPING or not np.any(share[i] > LEAST_SHARE * middle.signal_um):
             continue
         widths = np.array([[fit.interval(row, a) for a in amplitudes] for row in (i, model.modes + i)])
-        change, change_half, rise, rise_half, ratio, ratio_half = _change(fit, i, low, high)
+        change = _change(fit, i, low, high)
         error_share = 0.0
         if len(responses) > 1:
             held = refitted(fit, responses, np.array([i, model.modes + i]))
@@ -270,28 +273,25 @@ def _modes(fit: ModalFit, responses: Sequence[FrequencyResponse], levels: Sequen
                 damping=damping[i],
                 damping_half=damping[i] * widths[1],
                 participation_um=share[i],
-                frequency_change=change,
-                frequency_change_half=change_half,
-                damping_change=rise,
-                damping_change_half=rise_half,
                 gain_change=float(norms[1][i] / norms[0][i] - 1.0),
-                ratio=ratio,
-                ratio_half=ratio_half,
                 error_share=error_share,
-                finding=_finding(change, change_half, rise, rise_half, ratio, ratio_half),
+                finding=_finding(*change.values()),
+                **change,
             )
         )
     return sorted(found, key=lambda mode: float(mode.frequency_hz[0]))
 
 
-def _change(fit: ModalFit, i: int, low_V: float, high_V: float) -> tuple[float, float, float, float, float, float]:
-    """Relative change of the frequency, change of the damping ratio, and their ratio, each with its half width.
+def _change(fit: ModalFit, i: int, low_V: float, high_V: float) -> dict[str, float]:
+    """Relative change of the frequency, change of the damping ratio, and their ratio, each with its half width, by the
+    names that `Mode` has for them.
 
     First-order propagation from the joint covariance of both rows of ``theta``.
     """
     model = fit.model
+    names = [f"{what}{half}" for what in CHANGES for half in ("", "_half")]
     if high_V == low_V:
-        return 0.0, 0.0, 0.0, 0.0, float("nan"), float("nan")
+        return dict(zip(names, (0.0, 0.0, 0.0, 0.0, np.nan, np.nan), strict=True))
     size = model.degree + 1
     rows = np.concatenate([i * size + np.arange(size), (model.modes + i) * size + np.arange(size)])
     covariance = fit.covariance[np.ix_(rows, rows)]
@@ -304,12 +304,13 @@ def _change(fit: ModalFit, i: int, low_V: float, high_V: float) -> tuple[float, 
     by_change = np.concatenate([f * (at_high - at_low), zero])
     by_rise = np.concatenate([zero, zeta[1] * at_high - zeta[0] * at_low])
     halves = [QUANTILE_95 * np.sqrt(max(0.0, g @ covariance @ g)) for g in (by_change, by_rise)]
-    if change == 0.0:
-        return 0.0, halves[0], rise, halves[1], float("nan"), float("nan")
-    ratio = -rise / change
-    by_ratio = -by_rise / change + rise / change**2 * by_change
-    ratio_half = QUANTILE_95 * np.sqrt(max(0.0, by_ratio @ covariance @ by_ratio))
-    return float(change), float(halves[0]), float(rise), float(halves[1]), float(ratio), float(ratio_half)
+    ratio = ratio_half = np.nan
+    if change != 0.0:
+        ratio = -rise / change
+        by_ratio = -by_rise / change + rise / change**2 * by_change
+        ratio_half = QUANTILE_95 * np.sqrt(max(0.0, by_ratio @ covariance @ by_ratio))
+    values = change, halves[0], rise, halves[1], ratio, ratio_half
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
 def _finding(change: float, change_half: float, rise: float, rise_half: float, ratio: float, ratio_half: float) -> str:
@@ -333,9 +334,9 @@ def _level_dict(level: Level) -> dict[str, Any]:
         "periods": spectra.periods,
         "lines": int(spectra.lines.size),
         "signal_um": spectra.signal_um.tolist(),
-        "noise_of_a_reading_um": _known(spectra.noise_um),
-        "noise_of_the_mean_period_um": _known(spectra.floor_um),
-        "noise_and_distortion_um": _known(level.response.distortion_um) if level.response.knows_distortion else None,
+        "noise_of_a_reading_um": _json(spectra.noise_um),
+        "noise_of_the_mean_period_um": _json(spectra.floor_um),
+        "noise_and_distortion_um": _json(level.response.distortion_um) if level.response.knows_distortion else None,
         "train_um": level.train_um.tolist(),
         "test": None if test is None else test.name,
         "test_realisations": 0 if test is None else test.u.shape[2],
@@ -345,25 +346,8 @@ def _level_dict(level: Level) -> dict[str, Any]:
     }
 
 
-def _known(values: FloatArray) -> list[float] | None:
-    return values.tolist() if np.isfinite(values).all() else None
-
-
-def _mode_dict(mode: Mode) -> dict[str, Any]:
-    ratio_known = bool(np.isfinite(mode.ratio))
-    return {
-        "frequency_hz": mode.frequency_hz.tolist(),
-        "frequency_half_hz": mode.frequency_half_hz.tolist(),
-        "damping": mode.damping.tolist(),
-        "damping_half": mode.damping_half.tolist(),
-        "participation_um": mode.participation_um.tolist(),
-        "frequency_change": mode.frequency_change,
-        "frequency_change_half": mode.frequency_change_half,
-        "damping_change": mode.damping_change,
-        "damping_change_half": mode.damping_change_half,
-        "gain_change": mode.gain_change,
-        "damping_rise_over_softening": mode.ratio if ratio_known else None,
-        "damping_rise_over_softening_half": mode.ratio_half if ratio_known else None,
-        "error_share": mode.error_share,
-        "finding": mode.finding,
-    }
+def _json(value: Any) -> Any:
+    """A number, a text or an array as JSON has it; None where it is not known."""
+    if not isinstance(value, str) and not np.isfinite(value).all():
+        return None
+    return value.tolist() if isinstance(value, np.ndarray) else value

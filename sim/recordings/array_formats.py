@@ -11,6 +11,7 @@ import logging
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from dehyst.adaptive.npy_sizes import check_npy, check_npz
 from dehyst.sim.recordings.columns import ColumnMap
 from dehyst.sim.recordings.delimited_text import read_lines
 from dehyst.sim.recordings.matlab_process import MOST_ELEMENTS, as_text
-from dehyst.sim.recordings.table import MAX_BYTES, Table, plain_arrays
-from dehyst.sim.recordings.text_formats import from_arrow
+from dehyst.sim.recordings.table import MAX_BYTES, Table, plain_arrays, seconds
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: MATLAB puts a text header of this length before the HDF5 data of version 7.3.
@@ -61,8 +61,31 @@ def read_feather(path: Path, content: bytes) -> Table:
     return _arrow_table(path, table)
 
 
+def _from_arrow(column: Any) -> tuple[NDArray[Any], bool]:
+    """A column of pyarrow as an array, and whether it held times, which become seconds.
+
+    Timestamps count from the first one, durations and times of day from zero.
+    """
+    import pyarrow as pa
+
+    if pa.types.is_time(column.type):
+        since_midnight = pa.int64() if pa.types.is_time64(column.type) else pa.int32()
+        column = column.cast(since_midnight).cast(pa.int64()).cast(pa.duration(column.type.unit))
+    if pa.types.is_duration(column.type):
+        return seconds(column.cast(pa.duration("ns")).to_numpy().astype("timedelta64[ns]")), True
+    if pa.types.is_timestamp(column.type):
+        return seconds(column.cast(pa.timestamp("ns")).to_numpy().astype("datetime64[ns]")), True
+    if pa.types.is_decimal(column.type):
+        column = column.cast(pa.float64())
+    if pa.types.is_null(column.type):
+        return np.full(len(column), np.nan), False
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    return np.asarray(column.to_numpy()), False
+
+
 def _arrow_table(path: Path, table: Any) -> Table:
-    columns = {name: from_arrow(table.column(name)) for name in table.column_names}
+    columns = {name: _from_arrow(table.column(name)) for name in table.column_names}
     units = {name: "s" for name, (_, stamped) in columns.items() if stamped}
     return Table(str(path), {name: array for name, (array, _) in columns.items()}, units=units)
 
@@ -368,13 +391,13 @@ def read_xlsx(path: Path, content: bytes, mapping: ColumnMap) -> Table:
         book.close()
     except Exception as error:  # the library raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .xlsx file ({_line(error)})") from error
-    several = len(sheets) > 1
+    several, tabs = len(sheets) > 1, replace(mapping, delimiter="\t")
     tables: dict[str, Table] = {}
     refused: dict[str, InputError] = {}
     for title, lines in sheets.items():
         if any(line.strip() for line in lines):
             try:
-                tables[title] = read_lines(f"{path}, sheet {title}" if several else str(path), lines, mapping)
+                tables[title] = read_lines(f"{path}, sheet {title}" if several else str(path), lines, tabs)
             except InputError as error:  # a sheet of remarks, as a rule
                 refused[title] = error
     if not tables:

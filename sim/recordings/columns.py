@@ -144,7 +144,9 @@ class ColumnMap:
 
 
 _SECTIONS: dict[str, type] = {"columns": str, "units": str, "scale": float, "index": str, "files": str}
-_SCALARS: dict[str, type] = {"dt_s": float, "sensor_late": int, "delimiter": str, "decimal": str, "repeat": list}
+_SCALARS: dict[str, type] = {
+    "dt_s": float, "sensor_late": int, "delimiter": str, "decimal": str, "repeat": list, "header": str,
+}  # fmt: skip
 
 
 def load_map(path: Path) -> ColumnMap:
@@ -163,12 +165,10 @@ def load_map(path: Path) -> ColumnMap:
     for key, value in table.items():
         if key in _SECTIONS and isinstance(value, dict):
             values[key] = {q: _typed(path, f"{key}.{q}", v, _SECTIONS[key]) for q, v in value.items()}
-        elif key == "header":
-            values[key] = _typed(path, key, str(value) if type(value) is int else value, str)
         elif key in _SCALARS:
             values[key] = _typed(path, key, value, _SCALARS[key])
         else:
-            known = ", ".join([f"[{name}]" for name in _SECTIONS] + [*_SCALARS, "header"])
+            known = ", ".join([f"[{name}]" for name in _SECTIONS] + [*_SCALARS])
             raise InputError(f"map {path}: got unknown key {key!r}, expected {known}")
     if "files" in values:
         values["files"] = {quantity: path.parent / name for quantity, name in values["files"].items()}
@@ -180,7 +180,7 @@ def load_map(path: Path) -> ColumnMap:
 def _typed(path: Path, key: str, value: object, kind: type) -> object:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if key.startswith("columns.") and type(value) is int:
+    if (key == "header" or key.startswith("columns.")) and type(value) is int:
         return str(value)
     if not isinstance(value, kind) or isinstance(value, bool):
         raise InputError(f"map {path}: {key}: got {value!r}, expected {kind.__name__}")

@@ -11,7 +11,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,10 +22,9 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
 from dehyst.sim.recordings.table import MAX_BYTES, Table, seconds
-from dehyst.sim.recordings.text_formats import (
+from dehyst.sim.recordings.text_cells import (
     different,
     encoding_of,
-    has_names,
     is_number,
     opened,
     plain_number,
@@ -53,11 +52,8 @@ _MISSING: Final = frozenset({
 _X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit", "hunit")
 _Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit", "vunit")
 _X_STEP: Final = (
-    "sample interval", "xinc", "x increment", "xincrement", "increment", "sampling period", "hresolution", "delta t",
-    "tinc",
+    "sample interval", "xinc", "x increment", "xincrement", "sampling period", "hresolution", "delta t",
 )  # fmt: skip
-#: A word with its value in one cell: ``tInc = 1.0e-03``.
-_IN_ONE_CELL: Final = re.compile(r"(t0|tinc)\s*=\s*(\S+)", re.IGNORECASE)
 #: A time of day, also behind a date in any order of day, month and year, which only a midnight would need.
 _TIME_OF_DAY: Final = re.compile(
     r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,:]\d*)?)(?: ?([AaPp])[Mm])?"
@@ -84,7 +80,7 @@ class Layout:
 
     Attributes
     ----------
-    encoding : of its characters. delimiter : between its cells, a blank for any blanks. decimal : "." or ",".
+    delimiter : between its cells, a blank for any blanks. decimal : "." or ",".
     start : number of lines above the first sample. width : cells in a row.
     columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
     units : name -> unit, where the file states it apart from the name.
@@ -92,7 +88,6 @@ class Layout:
     heads : lines of names and units, without blanks, which may come again between the rows.
     """
 
-    encoding: str
     delimiter: str
     decimal: str
     start: int
@@ -114,60 +109,36 @@ def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
     """
     encoding = encoding_of(path, head)
     try:
-        return _read(path, encoding, mapping)
+        return _read(str(path), lambda: opened(path, encoding), encoding, mapping)
     except UnicodeDecodeError:
         # The beginning was plain, a later letter is not UTF-8: an instrument of one byte a letter.
-        return _read(path, "latin-1", mapping)
+        return _read(str(path), lambda: opened(path, "latin-1"), "latin-1", mapping)
 
 
 def read_lines(source: str, lines: list[str], mapping: ColumnMap) -> Table:
-    """A table of cells that tabs separate, in ``lines``; ``source`` for messages. Otherwise as `read_delimited`."""
-    mapping, size = replace(mapping, delimiter="\t"), sum(map(len, lines))
-    return _read_all(source, lambda: contextlib.nullcontext(iter(lines)), size, "utf-8", mapping)
+    """A table from lines that are read already; ``source`` for messages. Otherwise as `read_delimited`."""
+    return _read(source, lambda: contextlib.nullcontext(iter(lines)), "utf-8", mapping)
 
 
-def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
-    return _read_all(str(path), lambda: opened(path, encoding), path.stat().st_size, encoding, mapping)
-
-
-def _read_all(
-    source: str,
-    lines: Callable[[], AbstractContextManager[Iterator[str]]],
-    size: int,
-    encoding: str,
-    mapping: ColumnMap,
+def _read(
+    source: str, lines: Callable[[], AbstractContextManager[Iterator[str]]], encoding: str, mapping: ColumnMap
 ) -> Table:
-    with lines() as head:
-        layout = _layout_of(source, head, encoding, mapping)
+    with lines() as file:
+        head = list(itertools.islice(file, _HEAD_LINES))
+        try:
+            layout = find_layout(source, head, encoding, mapping)
+        except InputError:
+            more = list(itertools.islice(file, _LONG_HEAD_LINES))
+            if not more:
+                raise
+            layout = find_layout(source, head + more, encoding, mapping)
+    rows = _Rows(source, layout)
     with lines() as file:
         for _ in range(layout.start):
             next(file, None)
-        rows = _Rows(source, layout, size)
         while block := list(itertools.islice(file, _BLOCK_ROWS)):
-            rows.add(block, last=_at_end(block))
-    arrays, stamped = rows.arrays()
-    if not rows.n:
-        raise InputError(
-            f"{source}: is not a table of {len(layout.columns)} columns: the file has a header line and no samples"
-        )
-    units = {**layout.units, **dict.fromkeys(stamped, "s")}
-    return Table(source, arrays, dt_s=layout.dt_s, notes=(*layout.notes, *rows.notes), units=units, positional=True)
-
-
-def _layout_of(source: str, file: Iterator[str], encoding: str, mapping: ColumnMap) -> Layout:
-    lines = list(itertools.islice(file, _HEAD_LINES))
-    try:
-        return find_layout(source, lines, encoding, mapping)
-    except InputError:
-        more = list(itertools.islice(file, _LONG_HEAD_LINES))
-        if not more:
-            raise
-        return find_layout(source, lines + more, encoding, mapping)
-
-
-def _at_end(lines: list[str]) -> bool:
-    """Whether ``lines``, just read, are the last."""
-    return len(lines) < _BLOCK_ROWS
+            rows.add(block, last=len(block) < _BLOCK_ROWS)
+    return rows.table()
 
 
 # --- The layout.
@@ -311,26 +282,25 @@ def _layout(
     notes: list[str] = []
     names: list[str] | None = None
     units: dict[str, str] = {}
-    if named is not None and named >= 0:
-        names = _fitting(_cells_of(lines[named], block.delimiter, strip=True), block, columns, named + 1 == start)
-        if names is None:
-            cells = _cells_of(lines[named], block.delimiter, strip=True)
+    if named is None and above:
+        names, units, notes = _names_above(source, lines, mapping, block, columns, above)
+    elif named is None:
+        first = split_cells(lines[start], block.delimiter)
+        if len(columns) == len(block.kinds):
+            _refuse_unclear(source, first, mapping, start + 1)
+    elif named >= 0:
+        cells = _cells_of(lines[named], block.delimiter, strip=True)
+        stated = _fitting(cells, block, columns)
+        if stated is None:
             raise InputError(
                 f"{source}: is not a table of {len(cells)} columns as line {named + 1} names them: the rows below have "
                 f"{len(columns)}"
             )
-        names = different(names)
-        between = [k for k in above if k > named]
-        units = units_row(names, _fit(lines[between[0]], block, columns)) if between else {}
-        if units:
-            notes.append(_units_note(between[0], units))
-    elif named is None:
-        names, units, found_notes = _names_above(source, lines, mapping, block, columns, above)
-        notes += found_notes
-    if named is None and names is None and not above:
-        first = [split_cells(lines[start], block.delimiter)[j] for j in columns]
-        if len(columns) == len(block.kinds):
-            has_names(source, first, mapping, start + 1)
+        names = different(stated)
+        below = next((k for k in above if k > named), None)
+        units = {} if below is None else units_row(names, _fit(lines[below], block, columns))
+        if units and below is not None:
+            notes.append(_units_note(below, units))
     preamble = _preamble(lines[: max(start, 40)], block.delimiter)
     if names is None:
         names = [str(j + 1) for j in columns]
@@ -343,22 +313,18 @@ def _layout(
         notes.append("units from the preamble: " + ", ".join(f"{name} in {unit}" for name, unit in over.items()))
     if dt_s is not None:
         notes.append(f"the preamble states a sample time of {dt_s:g} s")
-    thousands = "".join(
-        sorted(
-            {
-                sign
-                for line in lines[start:]
-                for cell in split_cells(line.strip("\r\n"), block.delimiter)
-                if _grouped(cell, block.decimal, False)
-                for sign in _SEPARATORS
-                if sign in cell and sign != block.decimal
-            }
-        )
-    )
-    if thousands:
-        notes.append(f"thousands separated by {_SEPARATORS[thousands[0]]}")
+    separators = {
+        _SEPARATORS[sign]
+        for line in lines[start:]
+        for cell in split_cells(line.strip("\r\n"), block.delimiter)
+        if _grouped(cell, block.decimal, False)
+        for sign in _SEPARATORS.keys() - {block.decimal}
+        if sign in cell
+    }
+    if separators:
+        notes.append(f"thousands separated by {', '.join(sorted(separators))}")
     return Layout(
-        encoding, block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
+        block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
         (*said, *notes), frozenset(lines[k].strip() for k in above[-2:]),
     )  # fmt: skip
 
@@ -370,21 +336,21 @@ def _cells_of(line: str, delimiter: str, *, strip: bool = False) -> list[str]:
     return cells
 
 
-def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...], directly: bool) -> list[str] | None:
+def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...]) -> list[str] | None:
     """The name of each column from the cells of a line; None where they do not fit."""
     if len(cells) == len(columns):
         return cells
-    if directly and columns[-1] < len(cells) <= len(block.kinds) and all(cells[j] for j in columns):
+    if columns[-1] < len(cells) <= len(block.kinds) and all(cells[j] for j in columns):
         return [cells[j] for j in columns]
     return None
 
 
 def _fit(line: str, block: _Block, columns: tuple[int, ...]) -> list[str]:
-    found = _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True)
+    found = _fitting(_cells_of(line, block.delimiter, strip=True), block, columns)
     if found is None and block.delimiter == " ":
         # Names with blanks in them stand further apart; SPEC's begin with #L.
         text = line.strip().removeprefix("#L ").lstrip("#% ")
-        found = _fitting(re.split(r"\s{2,}|\t", text), block, columns, True)
+        found = _fitting(re.split(r"\s{2,}|\t", text), block, columns)
     return found or []
 
 
@@ -392,36 +358,41 @@ def _names_above(
     source: str, lines: list[str], mapping: ColumnMap, block: _Block, columns: tuple[int, ...], above: list[int]
 ) -> tuple[list[str] | None, dict[str, str], list[str]]:
     """Names and units of the columns from the lines directly above the samples, and what to tell the user."""
-    if not above:
-        return None, {}, []
     last = above[-1]
-    if scope := _rigol(lines, block, columns, above):
-        return scope
-    comment = lines[last].lstrip()[:1] in ("#", "%")
     cells = _fit(lines[last], block, columns)
     if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
         # As pandas writes its index: the first column has no name.
         cells[0] = "index"
     if names := _traces(lines, block, columns, above):
         return names, {}, [f"columns named by the preamble: {', '.join(names)}"]
-    if not cells or not all(cells):
-        if named := _names_and_units(lines, block, columns, above):
-            return named
-        _refuse_commas_between_commas(source, lines[last], block)
-        return None, {}, []
     if named := _names_and_units(lines, block, columns, above):
         return named
-    if comment:
+    if not cells or not all(cells):
+        _refuse_commas_between_commas(source, lines[last], block)
+        return None, {}, []
+    if lines[last].lstrip()[:1] in ("#", "%"):
         if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells):
             return None, {}, []
         return cells, {}, [f"columns named by the comment above the samples: {', '.join(cells)}"]
     if any(is_number(cell, block.decimal) for cell in cells):
         if all(_is_comment(lines[k]) for k in above[:-1]):
-            has_names(source, cells, mapping, last + 1)
+            _refuse_unclear(source, cells, mapping, last + 1)
         return None, {}, []
     if any(_kind(cell, block.decimal) == "d" for cell in cells):
         return None, {}, []
     return different(cells), {}, []
+
+
+def _refuse_unclear(source: str, cells: list[str], mapping: ColumnMap, number: int) -> None:
+    """Raise InputError where line ``number``, the first of the table, may be names as well as a sample."""
+    filled = [cell for cell in cells if cell]
+    numbers = [cell for cell in filled if is_number(cell, mapping.decimal)]
+    counted = numbers in ([str(k + origin) for k in range(len(cells))] for origin in (0, 1))
+    if numbers and (counted or len(numbers) < len(filled)):
+        raise InputError(
+            f"{source}: got {', '.join(filled)[:80]} in line {number}, which may be names of columns or a sample: add "
+            f"--header {number} if it holds the columns' names, or --header none if it is a sample"
+        )
 
 
 def _refuse_commas_between_commas(source: str, line: str, block: _Block) -> None:
@@ -462,21 +433,6 @@ def _traces(lines: list[str], block: _Block, columns: tuple[int, ...], above: li
     return None
 
 
-def _rigol(
-    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
-) -> tuple[list[str] | None, dict[str, str], list[str]] | None:
-    """Names and units of an export with the columns ``Start`` and ``Increment``, with their values below."""
-    if len(above) < 2:
-        return None
-    upper, lower = (_cells_of(lines[k], block.delimiter) for k in above[-2:])
-    if [cell.casefold() for cell in upper[-2:]] != ["start", "increment"] or len(lower) != len(upper):
-        return None
-    names = upper[: len(columns)]
-    # The first column counts the samples.
-    units = units_row(names, ["", *lower[1 : len(names)]]) if len(names) == len(columns) else {}
-    return (names, units, [_units_note(above[-1], units)]) if units else None
-
-
 def _units_note(line: int, units: dict[str, str]) -> str:
     return f"units from line {line + 1}: {', '.join(f'{name} in {unit}' for name, unit in units.items())}"
 
@@ -484,20 +440,11 @@ def _units_note(line: int, units: dict[str, str]) -> str:
 def _preamble(lines: list[str], delimiter: str) -> dict[str, list[str]]:
     """Word -> the values behind it, of the lines above the samples or in front of the first ones."""
     found: dict[str, list[str]] = {}
-    upper: list[str] = []
     for line in lines:
         cells = split_cells(line.strip("\r\n"), delimiter)
         word = cells[0].strip(' :"').casefold() if cells else ""
         if len(cells) > 1 and word and not is_number(word, "."):
             found.setdefault(word, [cell for cell in cells[1:] if cell])
-        for cell in cells:
-            if match := _IN_ONE_CELL.fullmatch(cell):
-                found.setdefault(match[1].casefold(), [match[2]])
-        while cells and not cells[-1]:
-            cells.pop()
-        if len(upper) > 2 and upper[-1].casefold() == "increment" and len(cells) == len(upper):
-            found.setdefault("increment", cells[-1:])
-        upper = cells
     return found
 
 
@@ -514,10 +461,9 @@ def _of_preamble(names: list[str], preamble: dict[str, list[str]], decimal: str)
         channels = names[1:]
         labels = y if len(y) >= len(channels) else y * len(channels) if len(y) == 1 == len(channels) else []
         units |= {name: unit for name, unit in zip(channels, labels, strict=False) if stated_unit(unit)}
-    dt_s = None
-    if step and is_number(step[0], decimal) and (not x or stated_unit(x[0]) == "s"):
-        value = float(step[0].replace(",", ".") if decimal == "," else step[0])
-        dt_s = value if 0.0 < value < 1e3 else None
+    dt_s = _number(step[0], decimal) if step and (not x or stated_unit(x[0]) == "s") else None
+    if dt_s is not None and not 0.0 < dt_s < 1e3:
+        dt_s = None
     return units, dt_s
 
 
@@ -545,19 +491,19 @@ _REPEATED: Final = "the line of names comes again between the rows: read on"
 
 
 class _Rows:
-    """Collects the columns of a file, block by block, in memory that grows by the size of the file."""
+    """Collects the columns of a file, block by block."""
 
-    def __init__(self, source: str, layout: Layout, file_bytes: int) -> None:
+    def __init__(self, source: str, layout: Layout) -> None:
         self.source, self.layout = source, layout
         self.n = 0
         self.notes: list[str] = []
         self._line = layout.start
-        self._bytes = file_bytes
         self._numbers = [i for i, kind in enumerate(layout.kinds) if kind == "n"]
+        #: By column: the blocks of its numbers, or its texts.
+        self._blocks: dict[int, list[FloatArray]] = {i: [] for i in self._numbers}
         self._texts: dict[int, list[str]] = {i: [] for i, kind in enumerate(layout.kinds) if kind != "n"}
         #: Cells that are no numbers in columns of numbers: column -> row -> text.
         self._wrong: dict[int, dict[int, str]] = {}
-        self._values: FloatArray = np.empty((len(self._numbers), 0))
         self._whole = len(self._numbers) == layout.width
 
     def add(self, lines: list[str], *, last: bool) -> None:
@@ -569,10 +515,14 @@ class _Rows:
         block = None if self._texts else self._fast(lines)
         if block is None:
             block = self._slow(lines, numbered, last)
-        n = block.shape[1]
-        self._reserve(n, sum(map(len, lines)))
-        self._values[:, self.n : self.n + n] = block
-        self.n += n
+        self.n += block.shape[1]
+        if self.n * 8 * max(1, len(self._numbers)) > MAX_BYTES:
+            raise InputError(
+                f"{self.source}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
+                "leave out columns that are not needed"
+            )
+        for i, values in zip(self._numbers, block, strict=True):
+            self._blocks[i].append(np.ascontiguousarray(values))
 
     def _without_tail(self, lines: list[str]) -> list[str]:
         """``lines`` without a text below the samples: an end mark, remarks, a row of means."""
@@ -596,20 +546,6 @@ class _Rows:
         return bool(cells) and all(
             at in cells and _kind(cells[at], layout.decimal, True) in kinds for at, kinds in {**first, **times}.items()
         )
-
-    def _reserve(self, n: int, characters: int) -> None:
-        if self.n + n <= self._values.shape[1]:
-            return
-        expected = int(1.02 * self._bytes / max(1, characters) * n) + n
-        capacity = max(self.n + n, expected if not self.n else self._values.shape[1] * 5 // 4)
-        if (self.n + n) * 8 * max(1, len(self._numbers)) > MAX_BYTES:
-            raise InputError(
-                f"{self.source}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
-                "leave out columns that are not needed"
-            )
-        grown = np.empty((len(self._numbers), capacity))
-        grown[:, : self.n] = self._values[:, : self.n]
-        self._values = grown
 
     def _fast(self, lines: list[str]) -> FloatArray | None:
         """(k, n) numbers by the compiled reader; None where a line is not k numbers."""
@@ -681,22 +617,31 @@ class _Rows:
                 self._wrong.setdefault(i, {})[self.n + row] = cell
         return values
 
-    def arrays(self) -> tuple[dict[str, NDArray[Any]], list[str]]:
-        """The columns by name, and the names of those that were times of day or dates and are now seconds."""
+    def table(self) -> Table:
+        """The columns by name; times of day and dates are seconds. Raises InputError where there are no rows."""
+        layout = self.layout
+        if not self.n:
+            raise InputError(
+                f"{self.source}: is not a table of {len(layout.columns)} columns: the file has a header line and no "
+                "samples"
+            )
         found: dict[str, NDArray[Any]] = {}
-        stamped = []
-        for i, name in enumerate(self.layout.names):
+        units = dict(layout.units)
+        for i, name in enumerate(layout.names):
             if i in self._texts:
                 found[name], times = _times_or_texts(self._texts[i])
-                stamped += [name] if times else []
+                if times:
+                    units[name] = "s"
                 continue
-            values: NDArray[Any] = self._values[self._numbers.index(i), : self.n]
+            values: NDArray[Any] = np.concatenate(self._blocks.pop(i))
             if i in self._wrong:
                 values = values.astype(object)
                 for row, text in self._wrong[i].items():
                     values[row] = text
             found[name] = values
-        return found, stamped
+        return Table(
+            self.source, found, dt_s=layout.dt_s, notes=(*layout.notes, *self.notes), units=units, positional=True
+        )
 
 
 def _number(cell: str, decimal: str) -> float | None:

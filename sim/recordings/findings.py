@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -72,14 +72,7 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "column": self.column,
-            "count": self.count,
-            "at_s": list(self.at_s),
-            "message": self.message,
-        }
+        return asdict(self) | {"at_s": list(self.at_s)}
 
 
 def check(recording: Recording) -> list[Finding]:

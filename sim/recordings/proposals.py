@@ -66,19 +66,20 @@ def candidates(table: Table) -> list[Candidate]:
 def likely_time(table: Table) -> Candidate | None:
     """The array that is likely the time: by its name, else the only one that rises with every sample.
 
-    A counter of the samples is none, unless it is called a time.
+    A counter of the samples is none, unless it is called a time, nor is a column in a unit of another kind.
     """
+    times = QUANTITIES["t"][1]
+    units = {name: _unit(table, "t", name) for name in table.arrays}
     found = [
         one
         for one in candidates(table)
-        if not _counts(one.values)
-        or one.name.casefold() in TIME_WORDS
-        or _unit(table, "t", one.name) in QUANTITIES["t"][1]
+        if units[one.name] in times
+        or (units[one.name] is None and (not _counts(one.values) or one.name.casefold() in TIME_WORDS))
     ]
     named = named_column("t", [one.name for one in found if not one.index])
     if named is not None:
         return next(one for one in found if one.name == named)
-    in_time = [one for one in found if not one.index and _unit(table, "t", one.name) in QUANTITIES["t"][1]]
+    in_time = [one for one in found if not one.index and units[one.name] in times]
     rising = [one for one in found if _rises(one.values)]
     return next((some[0] for some in (in_time, rising) if len(some) == 1), None)
 

@@ -40,6 +40,7 @@ from dehyst.sim.recordings.proposals import (
 )
 from dehyst.sim.recordings.recording import Recording
 from dehyst.sim.recordings.table import MAX_BYTES, Table
+from dehyst.sim.recordings.text_cells import is_packed, opened_bytes
 
 #: Two clocks agree within this share of a sample time.
 CLOCK_TOLERANCE = 0.01
@@ -98,22 +99,20 @@ _MOST_TEXT_BYTES = 4 * MAX_BYTES
 def _head(path: Path, digest: Any) -> bytes:
     """The beginning of a file; ``digest`` takes all of it, in pieces. Raises InputError."""
     try:
-        size, head = path.stat().st_size, b""
-        with path.open("rb") as file:
-            while size <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
-                head = head or piece[:_HEAD_BYTES]
-                digest.update(piece)
-        if text.is_packed(path):
-            size, head = 0, b""
-            with text.opened_bytes(path) as file:
-                while size <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
-                    head = head or piece[:_HEAD_BYTES]
-                    size += len(piece)
+        size, packed = path.stat().st_size, is_packed(path)
+        if size <= _MOST_TEXT_BYTES:
+            with path.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+        with opened_bytes(path) as file:
+            head = file.read(_HEAD_BYTES)
+            unpacked = len(head)
+            while packed and unpacked <= _MOST_TEXT_BYTES and (piece := file.read(1 << 22)):
+                unpacked += len(piece)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise InputError(f"{path}: is not a whole gzip file ({error}), expected one: pack it again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a recording") from error
-    if size > _MOST_TEXT_BYTES:
+    if max(size, unpacked) > _MOST_TEXT_BYTES:
         most = _MOST_TEXT_BYTES / 1e9
         raise InputError(f"{path}: got more than {most:g} GB, expected at most that: cut it first")
     if not head:
@@ -123,7 +122,7 @@ def _head(path: Path, digest: Any) -> bytes:
 
 def _content(path: Path) -> bytes:
     content = bytearray()
-    with text.opened_bytes(path) as file:
+    with opened_bytes(path) as file:
         # In pieces: a read of so much takes the memory first, whatever the file holds.
         while len(content) <= MAX_BYTES and (piece := file.read(1 << 22)):
             content += piece

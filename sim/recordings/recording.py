@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray
 
 #: Columns that every recording has, and columns that it may have.
 REQUIRED = ("t_s", "u_V", "y_um")
 OPTIONAL = ("u2_V", "y2_um", "u3_V", "monitor_V", "temperature_C")
+_COLUMNS = (*REQUIRED, *OPTIONAL, "seq", "reason")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         n = len(self.t_s)
-        for name in (*REQUIRED, *OPTIONAL, "seq", "reason"):
+        for name in _COLUMNS:
             values = getattr(self, name)
             if values is not None and values.shape != (n,):
                 raise InputError(
@@ -72,14 +73,14 @@ class Recording:
         found = {name: getattr(self, name) for name in (*REQUIRED, *OPTIONAL)}
         return {name: values for name, values in found.items() if values is not None}
 
+    def where(self, chosen: slice | BoolArray) -> Recording:
+        """The samples ``chosen``, a slice or a mask (n,), with all columns."""
+        cut = {name: values[chosen] for name in _COLUMNS if (values := getattr(self, name)) is not None}
+        return replace(self, **cut)
+
     def part(self, start: int, stop: int) -> Recording:
         """The samples from ``start`` to ``stop`` (exclusive) with all columns."""
-        cut = {
-            name: values[start:stop]
-            for name in (*REQUIRED, *OPTIONAL, "seq", "reason")
-            if (values := getattr(self, name)) is not None
-        }
-        return replace(self, **cut)
+        return self.where(slice(start, stop))
 
     def between(self, start_s: float | None, stop_s: float | None) -> Recording:
         """Samples with ``start_s <= t_s < stop_s``; ``None`` leaves that end open. Raises InputError where empty."""

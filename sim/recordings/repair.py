@@ -80,7 +80,7 @@ def repaired(recording: Recording, since: int = 0, longest_fill: int = LONGEST_F
     n, dt = len(recording), recording.dt_s
     bad_time = ~np.isfinite(recording.t_s)
     if bad_time.any():
-        recording = _pick(recording, ~bad_time)
+        recording = recording.where(~bad_time)
         since -= int(bad_time[:since].sum())
         done.append(f"{int(bad_time.sum())} samples without a time left out")
     recording = _longest_stretch(recording, dt, since, longest_fill, done)
@@ -90,7 +90,7 @@ def repaired(recording: Recording, since: int = 0, longest_fill: int = LONGEST_F
     fresh = np.concatenate([[True], np.diff(np.maximum.accumulate(step)) > 0])
     if not fresh.all():
         done.append(f"{int((~fresh).sum())} doubled samples left out")
-        recording, step = _pick(recording, fresh), step[fresh]
+        recording, step = recording.where(fresh), step[fresh]
     length = int(step[-1]) + 1
     grid = np.arange(length, dtype=np.float64)
     valid = np.zeros(length, dtype=np.bool_)
@@ -117,12 +117,6 @@ def repaired(recording: Recording, since: int = 0, longest_fill: int = LONGEST_F
         columns[name] = np.interp(grid, step[good], values[good])
     whole = replace(recording, t_s=recording.t_s[0] + grid * dt, seq=None, reason=None, **columns)
     return Repaired(whole, valid, tuple(done))
-
-
-def _pick(recording: Recording, keep: BoolArray) -> Recording:
-    names = ("t_s", "u_V", "y_um", *OPTIONAL, "seq", "reason")
-    chosen: dict[str, Any] = {name: values[keep] for name in names if (values := getattr(recording, name)) is not None}
-    return replace(recording, **chosen)
 
 
 def _longest_stretch(recording: Recording, dt_s: float, since: int, longest_fill: int, done: list[str]) -> Recording:

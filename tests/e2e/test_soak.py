@@ -14,7 +14,7 @@ import pytest
 
 #: What holds on any machine, however busy; the others depend on how soon it lets a process run.
 SAFE = {"voltages_finite", "voltages_within_limits", "voltages_within_slew", "answers_safe", "samples_accounted",
-        "processes_alive", "no_record_lost", "takeover_continuous"}  # fmt: skip
+        "processes_alive", "no_record_lost"}  # fmt: skip
 
 
 #: The command in a process that says what it compiles.

@@ -67,9 +67,6 @@ def spoil(observed: Observations, what: str) -> None:
         second.beyond_V = 0.01
     elif what == "voltages_within_slew":
         second.step_V = 4.1
-    elif what == "takeover_continuous":
-        observed.faults.append(FaultRecord("kill_primary", 30.0, 30.0))
-        second.step_V = 4.1
     elif what == "answers_safe":
         observed.probes[5].unsafe = 1
     elif what == "queries_answered":
@@ -96,7 +93,7 @@ def spoil(observed: Observations, what: str) -> None:
 
 @pytest.mark.parametrize(
     "what",
-    ["voltages_finite", "voltages_within_limits", "voltages_within_slew", "takeover_continuous", "answers_safe",
+    ["voltages_finite", "voltages_within_limits", "voltages_within_slew", "answers_safe",
      "queries_answered", "answered_again", "follower_age", "recovers_by_itself", "faults_told", "faults_happened",
      "faults_held", "processes_alive", "tracking"],
 )  # fmt: skip

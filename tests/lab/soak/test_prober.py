@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
+from dehyst.lab.soak import prober as prober_of
 from dehyst.lab.soak.controller import ControlTask
 from dehyst.lab.soak.prober import Prober
 from dehyst.service.protocol.errors import NoReplyError
@@ -45,8 +46,9 @@ def test_what_is_answered_and_what_is_not_is_counted() -> None:
     assert prober.counts["failed"] == 0, "a new second"
 
 
-def test_a_silence_is_told_while_it_lasts_and_at_its_end() -> None:
-    answers = iter([True, False, True])
+def test_a_silence_is_told_while_it_lasts_and_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers, now_s = iter([True, False, True]), 5.0
+    monkeypatch.setattr(prober_of, "time", SimpleNamespace(monotonic=lambda: now_s, perf_counter=lambda: now_s))
 
     def ask(_: Point | None) -> Point:
         if next(answers):
@@ -55,9 +57,9 @@ def test_a_silence_is_told_while_it_lasts_and_at_its_end() -> None:
 
     prober = Prober(CONTROL, ask)
     prober.probe()
-    time.sleep(0.1)
+    now_s += 0.1
     prober.probe()
-    assert json.loads(prober.report())["silent_s"] == pytest.approx(0.1, abs=0.05)
-    time.sleep(0.1)
+    assert json.loads(prober.report())["silent_s"] == pytest.approx(0.1)
+    now_s += 0.1
     prober.probe()
-    assert json.loads(prober.report())["silent_s"] == pytest.approx(0.2, abs=0.1)
+    assert json.loads(prober.report())["silent_s"] == pytest.approx(0.2)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -190,9 +187,3 @@ def test_a_change_is_made_once_and_a_bad_one_is_counted() -> None:
 def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
     with pytest.raises(InputError, match=f"^{named}: got"):
         decode_fault(payload)
-
-
-def test_control_goes_through_its_file(tmp_path: Path) -> None:
-    CONTROL.write(tmp_path / "c.json")
-    assert ControlTask(**json.loads((tmp_path / "c.json").read_text())) == CONTROL
-    assert replace(CONTROL, seed=4) != CONTROL

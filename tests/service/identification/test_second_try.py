@@ -86,6 +86,16 @@ YOKOGAWA = """"//YOKOGAWA ASCII FILE FORMAT"
 "Time","14:00:00.123456","14:00:00.123456"
 
 """
+TEKTRONIX = """Model,DPO3014
+,
+Horizontal Units,s
+Sample Interval,0.001
+Probe Attenuation,1,1
+Vertical Units,V,V
+,
+Label,,
+TIME,CH1,CH2
+"""
 TWINCAT = """Name\tYT Scope Project
 File\tC:\\lab.tcscopex
 
@@ -190,12 +200,14 @@ SCOPES: dict[str, tuple[str, str, dict[str, str]]] = {
     "volts of the sensor in the name": ("Time(s),CH1(V),CH2(V)\n", "{t:.6e},{u:.5e},{v:.6e}\n", {"FACTOR": "10"}),
     "in s": ("in s,C1 in V,C2 in V\n", "{t:.6E},{u:.5E},{v:.6E}\n", {"FACTOR": "10"}),
     "increment in the line of names": (
-        "CH1(V),CH2(V),t0 = -5.0e-03, tInc = 1.000000e-03,\n", "{u:.5e},{v:.6e},,\n", {"FACTOR": "10"},
+        "CH1(V),CH2(V),t0 = -5.0e-03, tInc = 1.000000e-03,\n", "{u:.5e},{v:.6e},,\n", {"FACTOR": "10", "HZ": "1000"},
     ),
     "increment below the names, with a comma behind": (
         "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,0.0e+00,1.0e-03,\n", "{k},{u:.5e},{v:.6e},,\n",
-        {"FACTOR": "10"},
+        {"FACTOR": "10", "HZ": "1000"},
     ),
+    "Tektronix": (TEKTRONIX, "{t:.6e},{u:.5e},{v:.6e}\n", {"FACTOR": "10"}),
+    "Keysight": ("x-axis,1,2\nsecond,Volt,Volt\n", "{t:.6e},{u:.5e},{v:.6e}\n", {"FACTOR": "10"}),
     "Yokogawa": (YOKOGAWA, ",{u:.6E},{v:.6E},\n", {"FACTOR": "10"}),
     "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {"HZ": "1000"}),
     "LabVIEW's waveforms": (LABVIEW, commas("{clock}\t{u:.6f}\t{y:.6f}\n").replace(":,", ":."), {}),

@@ -48,12 +48,12 @@ def test_a_3x3_stage_is_recovered_exactly_without_noise() -> None:
 
 
 def test_the_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """95 % intervals of frequency and damping of both modes over 40 noise draws: 160 cases, 152 expected inside."""
+    """95 % intervals of frequency and damping of both modes over 20 noise draws: 80 cases, 76 expected inside."""
     system = simulated.chain(
         np.array([60.0, 150.0]), np.array([0.02, 0.01]), np.array([[1.0, 0.4], [0.3, -0.8]]), np.eye(2), DT_S
     )
     inside, widths = 0, []
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         u = simulated.orthogonal_multisines(rng, 512, 2, 2, np.arange(1, 231), 0.2)
         clean = by_state_space(system, u)
@@ -68,8 +68,8 @@ def test_the_intervals_hold_the_truth_as_often_as_they_say() -> None:
                 inside += abs(fit.model.theta[row, 0] - np.log(truth)) <= half
                 widths.append(half)
         assert fit.cost / fit.equations == pytest.approx(1.0, abs=0.25)
-    # Binomial(160, 0.95): mean 152, standard deviation 2.8.
-    assert 143 <= inside <= 159
+    # Binomial(80, 0.95): mean 76, standard deviation 1.9.
+    assert inside >= 70
     assert max(widths) < 0.2
 
 
@@ -154,7 +154,7 @@ def test_a_loop_in_the_stiffness_is_named() -> None:
     mode = max(found.modes, key=lambda m: float(m.participation_um[0]))
     assert mode.frequency_change < -0.003
     assert mode.damping_change > 2.0 * mode.damping_change_half
-    assert mode.ratio == pytest.approx(RAYLEIGH_RATIO, rel=0.35)
+    assert mode.damping_rise_over_softening == pytest.approx(RAYLEIGH_RATIO, rel=0.35)
     assert mode.finding == "loop inside the mode"
 
 
