@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import vectors
 from dehyst import service
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
 from dehyst.service.client.follower import Follower
 from dehyst.service.protocol.model import decode_model
+from tests.vectors import make_vectors as vectors
 
 OTHERS = (
     "numba", "llvmlite", "scipy", "pyarrow", "matplotlib", "rerun", "psutil", "threadpoolctl", "h5py", "nptdms",
