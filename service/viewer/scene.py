@@ -11,7 +11,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
-from dehyst.service.viewer.layout import Plane, grown
+from dehyst.service.viewer.plane import Plane, grown
 from dehyst.service.viewer.records import (
     Diagnostics,
     Event,
@@ -292,11 +292,8 @@ class Scene:
     def _plane(self, name: str, x: FloatArray, y: FloatArray, t_s: float, seq: int) -> Plane | None:
         """The axes that contain these data, drawn again when they have to grow; None while nothing is finite."""
         old = self._planes.get(name)
-        x_fixed, y_fixed = None, None
-        if name == style.LOOP_PLANE:
-            x_fixed, y_fixed = self.config.u_limits_V, self.config.y_limits_um
-        x_limits = x_fixed or grown(old.x_limits if old else None, x)
-        y_limits = y_fixed or grown(old.y_limits if old else None, y)
+        x_limits = grown(old.x_limits if old else None, x)
+        y_limits = grown(old.y_limits if old else None, y)
         if x_limits is None or y_limits is None:
             return None
         if old is not None and (x_limits, y_limits) == (old.x_limits, old.y_limits):
