@@ -16,9 +16,8 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.answering import derivatives
 from dehyst.service.answers.guard import Limits, limit_voltage
-from dehyst.service.export import Frozen, write_export
 from dehyst.service.export.c_source import domain
-from dehyst.service.export.exporting import trial_motion, voltages
+from dehyst.service.export.exporting import Frozen, trial_motion, voltages, write_export
 from dehyst.service.protocol.model import decode_model
 from tests.service.export.compiled import STRICT, Run, compiled, needs_a_compiler
 

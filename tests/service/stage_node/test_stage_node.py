@@ -297,18 +297,18 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
     sent: list[wire.SampleBatch] = []
     flowing = threading.Event()
 
-    def put(payload: bytes) -> None:
+    def put(*columns: np.ndarray) -> None:
         flowing.wait(10.0)
-        sent.append(wire.decode_samples(payload))
+        sent.append(wire.SampleBatch(*columns))
 
-    ring = SampleRing(0.001, put)
-    sender = Sender([ring], lambda: None)
-    ring.write(0, 0.0, 0.0)
+    ring = SampleRing(put)
+    sender = Sender([ring])
+    ring.write(0, 0.0, 0.0, 0.0)
     sender.wake()
     start = time.monotonic()
     n = RING_SIZE + 5000
     for k in range(1, n):
-        ring.write(k, float(k), -float(k))
+        ring.write(k, 1e-3 * k, float(k), -float(k))
         sender.wake()
     assert time.monotonic() - start < 5.0
     flowing.set()
