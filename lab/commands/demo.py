@@ -70,23 +70,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
-    stop = StopSignal(raising=True)
-    show = progress_printer(args.quiet)
-
-    def say(text: str) -> None:
-        stop.look()
-        show(text)
-
+    say = progress_printer(args.quiet, StopSignal(raising=True).look)
     done = session.run(
-        args.out,
-        fast=args.fast,
-        duration_s=args.duration,
-        seed=args.seed,
-        view=view,
-        say=say,
-        stage=args.stage,
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage,
         strict=args.strict,
-    )
+    )  # fmt: skip
     if args.json:
         print(json.dumps(done.summary))
     else:
@@ -117,12 +105,7 @@ def _run_mirror(args: argparse.Namespace) -> int:
     from dehyst.lab.demo import mirror
     from dehyst.sim.mirror import MirrorConfig
 
-    stop, show = StopSignal(raising=True), progress_printer(args.quiet)
-
-    def say(text: str) -> None:
-        stop.look()
-        show(text)
-
+    say = progress_printer(args.quiet, StopSignal(raising=True).look)
     config = MirrorConfig(side=args.side, seed=args.seed)
     summary = mirror.run(args.out, config, args.duration, say)
     if args.json:

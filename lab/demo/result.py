@@ -10,6 +10,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.demo.plan import MODELS, Plan
+from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.reports.plot_style import figure, line, save
 from dehyst.service.viewer.colours import EVENT, REFERENCE, model_colour
 
@@ -39,9 +40,7 @@ def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
 
 def worst_stretch(error_um: FloatArray, plan: Plan) -> dict[str, float]:
     """Largest mean absolute error over ``WORST_S`` of the whole run, percent of the range, and where it begins, s."""
-    n = round(WORST_S / plan.dt_s)
-    sums = np.concatenate(([0.0], np.cumsum(np.abs(error_um))))
-    means = (sums[n:] - sums[:-n]) / n
+    means = moving_mean(np.abs(error_um), round(WORST_S / plan.dt_s))
     at = int(np.argmax(means))
     return {"mae_pct": float(100.0 * means[at] / plan.range_um), "t_s": at * plan.dt_s}
 

@@ -157,4 +157,5 @@ def _desk(causes: list[rrb.Spatial2DView], unit: str) -> rrb.Blueprint:
     loop = plane_view("Loop: reading over voltage", "loop")
     middle = rrb.Vertical(rrb.Tabs(*causes, active_tab=0), loop) if causes else loop
     page = rrb.TextDocumentView(name="Report", origin="/report")
-    return desk(rrb.Horizontal(left, middle, page, column_shares=(4.0, 4.0, 3.0)), TIMELINE)
+    views = rrb.Horizontal(left, middle, page, column_shares=(4.0, 4.0, 3.0))
+    return desk(views, rrb.TimePanel(state="collapsed", timeline=TIMELINE))

@@ -6,8 +6,9 @@ import os
 import subprocess
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -33,11 +34,9 @@ VIEWER_MEMORY, SERVER_MEMORY = "1GiB", "64MiB"
 
 
 class RerunSink:
-    """Draws into the file ``rrd`` or the viewer at ``connect``. Close it, or the end of the run may be missing.
+    """Draws into the file ``rrd``, or without one into the viewer at ``connect``.
 
-    Raises
-    ------
-    InputError : both or neither of ``rrd`` and ``connect`` given, or the file cannot be written.
+    Close it, or the end of the run may be missing. Raises InputError if the file cannot be written.
     """
 
     def __init__(
@@ -48,8 +47,6 @@ class RerunSink:
         connect: str | None = None,
         recording_id: str | None = None,
     ) -> None:
-        if (rrd is None) == (connect is None):
-            raise InputError(f"rrd, connect: got {rrd!r} and {connect!r}, expected exactly one of them")
         views = blueprint(config)
         # The live stream and the file of one run have the same id, so that the viewer shows them as one.
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id or str(uuid.uuid4()))
@@ -137,13 +134,13 @@ def plane_view(name: str, origin: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=[16, 16, 18], visual_bounds=bounds)
 
 
-def desk(views: rrb.Container, timeline: str, **panel: str) -> rrb.Blueprint:
-    """A blueprint of these views alone; ``panel`` : options of the time panel."""
+def desk(views: rrb.Container, panel: rrb.TimePanel) -> rrb.Blueprint:
+    """A blueprint of these views alone, with the time panel."""
     return rrb.Blueprint(
         views,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=timeline, **panel),
+        panel,
         auto_views=False,
     )
 
@@ -211,7 +208,7 @@ def blueprint(config: SceneConfig) -> rrb.Blueprint:
         row_shares=(1.0, 1.0, 0.8, 0.8, 1.0),
     )
     views = rrb.Horizontal(tracking, shapes, health, column_shares=(1.5, 1.0, 0.95))
-    return desk(views, TIMELINE, play_state="following")
+    return desk(views, rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"))
 
 
 def viewer_command(port: int, *, headless: bool = False, web_port: int | None = None) -> list[str]:
@@ -276,8 +273,9 @@ def in_order(records: Iterable[Record]) -> list[Record]:
 
 def cut(record: Tracking, piece_s: float = PIECE_S) -> Iterator[Tracking]:
     """A long `Tracking` in pieces of at most ``piece_s``."""
-    _model, *columns = (getattr(record, column.name) for column in fields(record))
+    names = ("seq", "t_s", "u_V", "y_um", "reference_um", "std_V")
+    columns: dict[str, Any] = {name: getattr(record, name) for name in names if getattr(record, name) is not None}
     edges = np.flatnonzero(np.diff(record.t_s // piece_s)) + 1
     for part in np.split(np.arange(len(record.seq)), edges):
         if part.size:
-            yield Tracking(record.model, *(None if column is None else column[part] for column in columns))
+            yield replace(record, **{name: column[part] for name, column in columns.items()})

@@ -262,7 +262,7 @@ class Scene:
 
     def _draw_planes(self, record: Tracking, main: bool, rows: FloatArray, at_s: float) -> None:
         seq = int(np.interp(at_s, record.t_s, record.seq))
-        hue = style.colour(record.model, self.config.models)
+        hue = style.colour(record.model)
         rows = rows[:: max(1, len(rows) // LOOP_POINTS)]
         y_um, wanted_um = rows[:, 2], rows[:, 3]
         plane = self._plane(style.DEVIATION_PLANE, wanted_um, wanted_um - y_um, at_s, seq)
@@ -339,7 +339,7 @@ class Scene:
         if y_um is not None and v_um_per_s is not None and y_um.size == v_um_per_s.size:
             plane = self._plane(style.WINDOW_PLANE, y_um, v_um_per_s, t_s, seq)
             if plane is not None:
-                hue = style.colour(self.config.models[0], self.config.models)
+                hue = style.colour(self.config.models[0])
                 self.canvas.points(style.WINDOW_POINTS, t_s, seq, plane.points(y_um, v_um_per_s), hue, 0.7)
 
     def _counter(self, name: str, t_s: float, seq: int, value: Any) -> None:

@@ -17,28 +17,22 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.commands.stage import parse_change
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import SURELY, open_client
 from dehyst.service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
 from dehyst.service.stage_node.faults import fault_key
-from dehyst.service.stage_node.node import NodeConfig, status_key
+from dehyst.service.stage_node.node import status_key
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
+from tests.service.conftest import unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 @contextmanager
 def stage_process(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    endpoint = free_endpoint()
+    endpoint = f"tcp/127.0.0.1:{unused_port()}"
     command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -263,18 +257,6 @@ def test_command_buffer_takes_by_number_and_holds_what_is_missing() -> None:
     assert [buffer.take(k) for k in range(8, 40)] == [80.0] * 32
     with pytest.raises(InputError, match=r"seq: got 56, expected at most 55"):
         buffer.put(wire.Block(40, np.zeros(17)))
-
-
-def test_change_option() -> None:
-    assert parse_change("30:gain_drift.gain=-0.06,resonance.payload_ratio=1") == (
-        30.0,
-        {"gain_drift.gain": -0.06, "resonance.payload_ratio": 1.0},
-    )
-
-
-def test_bad_node_configuration() -> None:
-    with pytest.raises(InputError, match="ticks: got 0"):
-        NodeConfig(preset("rich"), "t", ("x",), ticks=0)
 
 
 def test_stage_file_and_options_make_the_configuration(tmp_path: Path) -> None:
