@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import importlib.util
 import io
 import json
@@ -135,18 +136,21 @@ def test_modes_run_as_printed(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "work"),
-    [("diagnose", "dehyst.sim.diagnosis.diagnose.diagnose_prepared"), ("rehearse", "dehyst.lab.rehearsal.rehearse")],
+    ("command", "module", "work"),
+    [
+        ("diagnose", "dehyst.sim.diagnosis.diagnose", "diagnose_prepared"),
+        ("rehearse", "dehyst.lab.rehearsal", "rehearse"),
+    ],
 )
 def test_examples_that_take_minutes_are_read_as_printed(
-    command: str, work: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, module: str, work: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Up to the work itself: files, columns, plants and events."""
 
     def begins(*_: object, **__: object) -> None:
         raise InputError("here the work begins")
 
-    monkeypatch.setattr(work, begins)
+    monkeypatch.setattr(importlib.import_module(module), work, begins)
     for example in examples(command):
         where = ROOT if "examples/" in example else folder
         out = () if "--out" in example else ("--out", str(folder / "out"))
