@@ -96,7 +96,7 @@ fuzz: setup-test ## a million malformed payloads, by coverage, and a live servic
 	$(BIN)/python -m benchmarks.fuzz --out out/fuzz
 
 vectors: setup ## make the test vectors of the protocol anew
-	$(BIN)/python -m benchmarks.vectors
+	$(BIN)/python -m tests.vectors.make_vectors
 
 blind: setup-test ## score the diagnosis on 218 recordings with hidden effects (about half an hour)
 	$(BIN)/python -m tests.hidden.blind

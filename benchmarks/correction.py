@@ -7,7 +7,7 @@ Errors are mean absolute errors of the true position in percent of the commanded
 correction and for the learner alike: age 1 is the reading of the sample before.
 
 ``--cases raster`` follows triangles of 5, 15 and 30 Hz, 20 lines each, from a rest, with readings of each age; errors
-are means of a line. ``--picture FILE`` draws those of the runs in ``--table``.
+are means of a line.
 """
 
 from __future__ import annotations
@@ -27,13 +27,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from benchmarks.measured import Source, data_folder
 from dehyst.adaptive.correction.integral import Correction, sensitivity
-from dehyst.adaptive.identification import identify_lssvm
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
-from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
-from dehyst.baselines.prandtl_ishlinskii.operators import play_step
 from dehyst.lab.rehearsal import RehearsalConfig, identify
 from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
 from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
@@ -108,30 +103,6 @@ class Unbounded(Correcting):
         return super().voltage(first, model, points, memory, (answer[0], math.inf))
 
 
-class FittedStack:
-    """A plant that moves as a Prandtl-Ishlinskii model of a measured record, with the noise of its sensor."""
-
-    NOISE_UM: Final = 0.07
-
-    def __init__(self, parameters: MpiParameters, dt_s: float) -> None:
-        self.dt_s, self.u_min_V, self.u_max_V = dt_s, 0.0, 5.0
-        self._parameters, self._state_V = parameters, parameters.start(0.0)
-        self._still = replace(parameters, lag_s=0.0)
-        self._keep = math.exp(-dt_s / parameters.lag_s) if parameters.lag_s > 0.0 else 0.0
-        self._um = self._still.simulate(np.zeros(1), dt_s).item()
-        self._noise = np.random.default_rng(11)
-
-    def run(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) true displacement and reading, µm, under (n,) voltages."""
-        true_um = np.empty(u_V.size)
-        for k in range(u_V.size):
-            true_um[k] = self._um
-            play_step(u_V[k], self._still.r_, self._state_V)
-            goal = self._still.simulate(u_V[k : k + 1], self.dt_s, self._state_V).item()
-            self._um = goal + self._keep * (self._um - goal)
-        return true_um, true_um + self.NOISE_UM * self._noise.standard_normal(u_V.size)
-
-
 @dataclass(frozen=True, slots=True)
 class Course:
     """A stage, identified, and the motion that all controllers are to make it follow."""
@@ -154,36 +125,11 @@ class Course:
         low_V, high_V = traits.excite_V
         known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
         mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
-        return cls.along(seed, traits.hysteresis, factory, low_V, mode_Hz, known)
-
-    @classmethod
-    def measured(cls, seed: int) -> Course:
-        """A stack that others measured: identified from one record, moved as another family fits another record."""
-        dt_s, u_V, y_um = Source("picma_stack/model_sine_1hz.csv").read(data_folder())
-        other = Source("picma_stack/test_ramped_sine_ff.csv").read(data_folder())
-        parameters = identify_mpi(other[1], other[2], dt_s, fit_lag=True)[0]
-        model, report = identify_lssvm(u_V, y_um, dt_s, name=LEARN)
-        low_V, high_V, f = float(u_V.min()), float(u_V.max()), model.features
-        # The sensor's zero is another one in each record. The stage rests where the first record begins.
-        shift_um = float(np.mean(y_um - parameters.simulate(u_V, dt_s)))
-        parameters = replace(parameters, y_ref_um=parameters.y_ref_um + shift_um)
-        rest_V = float(u_V[0])
-        limits = Limits(0.0, 5.0, 500.0 * (high_V - low_V))
-        known = IdentifiedPlant(
-            {LEARN: model}, u_V, y_um, dt_s, limits, f.y_min_um, f.y_max_um, f.y_rest_um, report.heldout_mae_pct
-        )
-        return cls.along(seed, "measured stack", lambda: FittedStack(parameters, dt_s), rest_V, NO_MODE_HZ, known)
-
-    @classmethod
-    def along(
-        cls, seed: int, name: str, make: PlantFactory, low_V: float, mode_Hz: float, known: IdentifiedPlant
-    ) -> Course:
-        """An identified stage, and the motion of ``seed``."""
         span, n = known.high_um - known.low_um, round(SECONDS / known.dt_s)
         wish = ReferenceRequest(known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, SECONDS, seed)
         wanted = RandomReference(wish)(np.arange(n) * known.dt_s)
         range_um = float(np.ptp(wanted.y_um[round(2.0 / known.dt_s) :]))
-        return cls(seed, name, make, low_V, mode_Hz, known, wanted, range_um)
+        return cls(seed, traits.hysteresis, factory, low_V, mode_Hz, known, wanted, range_um)
 
     def at_rest(self) -> Course:
         """The same motion, which comes to rest with a smooth ramp after `REST_S`."""
@@ -452,23 +398,6 @@ def raster_table(records: Sequence[Record]) -> str:
     )  # fmt: skip
 
 
-def picture(records: Sequence[Record], file: Path) -> None:
-    """Draw the medians of the error of each line, readings one sample old."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(RASTERS_HZ), figsize=(11, 3.6), sharey=True, layout="constrained")
-    for panel, frequency_Hz in zip(axes, RASTERS_HZ, strict=True):
-        for way in RASTER_WAYS:
-            of = [r["lines"] for r in records if (r["frequency_Hz"], r["age"], r["way"]) == (frequency_Hz, 1, way)]
-            if of:
-                panel.semilogy(np.arange(1, LINES + 1), np.median(of, axis=0), label=way)
-        panel.set(title=f"{frequency_Hz:g} lines/s", xlabel="line", xticks=SHOWN)
-        panel.grid(alpha=0.3)
-    axes[0].set_ylabel("mean error, % of the range")
-    axes[-1].legend(fontsize=8)
-    figure.savefig(file)
-
-
 def tables(records: Sequence[Record]) -> str:
     """Markdown: errors by controller and age, and what happens."""
     records = [record for record in records if "failed" not in record]
@@ -526,7 +455,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--first", type=int, default=1, help="first seed (%(default)s)")
     parser.add_argument("--stages", type=int, default=2, help="number of stages (%(default)s)")
-    parser.add_argument("--measured", action="store_true", help="motions on a stack that others measured instead")
     parser.add_argument("--cases", nargs="+", choices=(*CASES, RASTER), default=tuple(CASES),
                         help="what happens, or rasters (all but rasters)")  # fmt: skip
     parser.add_argument(
@@ -535,7 +463,6 @@ def main() -> None:
     parser.add_argument("--ways", nargs="+", choices=RASTER_WAYS, default=RASTER_WAYS, help="of rasters (all)")
     parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
     parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
-    parser.add_argument("--picture", type=Path, help="with --table: draw the errors of the lines of rasters")
     args = parser.parse_args()
     records: list[Record] = []
     if args.table is not None:
@@ -544,7 +471,7 @@ def main() -> None:
         seeds = (seed for seed in itertools.count(args.first) if random_plant(seed).traits.dt_s > FASTEST_S)
         for seed in itertools.islice(seeds, args.stages):
             begin = time.process_time()
-            course = Course.measured(seed) if args.measured else Course.of(seed)
+            course = Course.of(seed)
             new = run_stage(course, [case for case in args.cases if case != RASTER])
             new += run_rasters(course, args.ages, args.ways) if RASTER in args.cases else []
             records += new
@@ -554,8 +481,6 @@ def main() -> None:
                 with args.json.open("a", encoding="utf-8") as out:
                     out.writelines(json.dumps(record) + "\n" for record in new)
     print(tables(records))
-    if args.picture is not None:
-        picture([r for r in records if r["case"] == RASTER and "failed" not in r], args.picture)
 
 
 if __name__ == "__main__":

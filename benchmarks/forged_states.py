@@ -15,17 +15,13 @@ from __future__ import annotations
 import argparse
 import json
 import struct
-import subprocess
-import sys
 import tempfile
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.small_models import small_models
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.adaptive.types import FloatArray, InverseModel, StateDict
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
@@ -41,6 +37,7 @@ from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointMeta, encode_checkpoint, restore_newest
 from dehyst.service.storage.model_file import Bundle, BundleMeta
+from tests.service.conftest import make_models
 
 DT_S: Final = 1e-3
 #: Samples before a state is copied, and after it was taken; samples of a batch.
@@ -52,7 +49,7 @@ def bundle() -> Bundle:
     """Four models of one stage of 11 µm/V, one of each kind that learns."""
     seen = Domain(0.0, 90.0, 1e4)
     found: dict[str, InverseModel] = {
-        "lssvm_adaptive": small_models()["lssvm_adaptive"],
+        "lssvm_adaptive": make_models()["lssvm_adaptive"],
         "linear": LinearInverse(LinearParameters(11.0, 1.0), DT_S, seen, 0.05),
         "mpi": MpiInverse(_MPI, DT_S, seen, 0.01),
         "bouc_wen": BoucWenInverse(TABLE_2_1, DT_S, seen, 0.01),
@@ -146,115 +143,70 @@ class Victims:
 # --- Forging.
 
 
-def forged(state: StateDict, rng: np.random.Generator) -> tuple[StateDict, str]:
-    """A copy of ``state`` with one to three entries replaced, and what was done."""
-    made, words = dict(state), []
-    arrays = [name for name, value in state.items() if isinstance(value, np.ndarray)]
-    for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
-        names = arrays if rng.random() < 0.7 else list(state)
-        name = names[int(rng.integers(len(names)))]
-        value = made.get(name)
-        if isinstance(value, np.ndarray):
-            made[name], what = _forged_array(value, rng)
-        elif rng.random() < 0.15:
-            made.pop(name, None)
-            what = "removed"
-        else:
-            made[name] = what = VALUES[int(rng.integers(len(VALUES)))]
-        words.append(f"{name}: {str(what)[:40]}")
-    return made, "; ".join(words)
-
-
 VALUES: Final[tuple[Any, ...]] = (
     -1, 0, 1, 7, 2**31, 2**62, 2**63, 10**30, -(2**62), -1e308, 1e308, 5e-324, 0.5, True, None, "", "nan", "sorcery",
     [], [1, 2], {}, np.array(np.nan), np.array(np.inf), np.zeros(0), np.zeros((3, 3)), np.array(-(2**63)),
 )  # fmt: skip
 
 
-#: By name of what is done: an array in, another out.
-CHANGES: Final[dict[str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]]] = {
-    "emptied": lambda value: np.zeros((0,) * max(value.ndim, 1), value.dtype),
-    "cut to half": lambda value: value[: value.shape[0] // 2].copy() if value.ndim else value[None],
-    "cut by a column": lambda value: value[..., :-1].copy() if value.ndim else value[None],
-    "doubled": lambda value: np.concatenate([value, value]) if value.ndim else np.array([value, value]),
-    "as 32 bits": lambda value: value.astype("<i4"),
-    "as bytes": lambda value: value.astype("|u1"),
-    "as single precision": lambda value: value.astype("<f4"),
-    "NaN": lambda value: np.full(value.shape, np.nan),
-    "infinite": lambda value: np.full(value.shape, np.inf),
-    "1e300": lambda value: np.full(value.shape, 1e300),
-    "2^62": lambda value: np.full(value.shape, 2**62),
-    "-2^40": lambda value: np.full(value.shape, -(2**40)),
-    "of another dimension": lambda value: value[None],
-    "flat": lambda value: value.ravel(),
-    "transposed": lambda value: value.T.copy() if value.ndim > 1 else value.reshape(-1, 1),
-}
+#: What is done to an array.
+CHANGES: Final[tuple[Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]], ...]] = (
+    lambda value: np.zeros((0,) * max(value.ndim, 1), value.dtype),
+    lambda value: value[: value.shape[0] // 2].copy() if value.ndim else value[None],
+    lambda value: value[..., :-1].copy() if value.ndim else value[None],
+    lambda value: np.concatenate([value, value]) if value.ndim else np.array([value, value]),
+    lambda value: value.astype("<i4"),
+    lambda value: value.astype("|u1"),
+    lambda value: value.astype("<f4"),
+    lambda value: np.full(value.shape, np.nan),
+    lambda value: np.full(value.shape, np.inf),
+    lambda value: np.full(value.shape, 1e300),
+    lambda value: np.full(value.shape, 2**62),
+    lambda value: np.full(value.shape, -(2**40)),
+    lambda value: value[None],
+    lambda value: value.ravel(),
+    lambda value: value.T.copy() if value.ndim > 1 else value.reshape(-1, 1),
+)
 
 
 #: Bytes of one edit of `edited`: number of the entry, number of the change, and a value.
 EDIT: Final = struct.Struct("<HB8s")
+#: The change that removes an entry; those just before it put a number of any size there.
+REMOVED: Final = len(CHANGES) + len(VALUES) + 3
 #: Most edits of one state.
 MOST_EDITS: Final = 8
 
 
 def edited(state: StateDict, data: bytes) -> StateDict:
     """A copy of ``state`` with entries replaced as ``data`` says, so that a fuzzer reaches every entry by few bytes."""
-    made, names, changes = dict(state), list(state), list(CHANGES.values())
+    made, names = dict(state), list(state)
     for at in range(0, min(len(data), MOST_EDITS * EDIT.size) - EDIT.size + 1, EDIT.size):
         entry, change, raw = EDIT.unpack_from(data, at)
         name = names[entry % len(names)]
         value, number = state[name], np.frombuffer(raw, dtype="<f8")
-        kinds = len(changes) + len(VALUES) + 4
-        what = change % kinds
-        if what < len(changes):
-            made[name] = changes[what](np.asarray(value)) if np.asarray(value).dtype.kind in "fiub" else raw
-        elif what < len(changes) + len(VALUES):
-            made[name] = VALUES[what - len(changes)]
-        elif what == kinds - 1:
+        what = change % (REMOVED + 1)
+        if what < len(CHANGES):
+            numeric = np.asarray(value).dtype.kind in "fiub"
+            made[name] = CHANGES[what](np.asarray(value)) if numeric else VALUES[raw[0] % len(VALUES)]
+        elif what < len(CHANGES) + len(VALUES):
+            made[name] = VALUES[what - len(CHANGES)]
+        elif what == REMOVED:
             made.pop(name, None)
-        elif what == kinds - 2 and isinstance(value, np.ndarray) and value.size:
+        elif what == REMOVED - 1 and isinstance(value, np.ndarray) and value.size:
             made[name] = value.astype(np.float64)
             made[name].flat[raw[0] * value.size // 256] = number[0]
         else:
-            made[name] = float(number[0]) if what == kinds - 3 else int.from_bytes(raw, "little", signed=True)
+            made[name] = float(number[0]) if what == REMOVED - 2 else int.from_bytes(raw, "little", signed=True)
     return made
 
 
-def _forged_array(value: np.ndarray[Any, Any], rng: np.random.Generator) -> tuple[Any, str]:
-    if rng.random() < 0.9:
-        what = list(CHANGES)[int(rng.integers(len(CHANGES)))]
-        return CHANGES[what](value), what
-    one = value.astype(np.int64 if value.dtype.kind == "i" else np.float64)
-    if one.size:
-        one.flat[int(rng.integers(one.size))] = rng.choice([-1, 2**31, 2**62, -(2**31), 10**6])
-    return one, "one element"
-
-
-def run_in_processes(out: Path, count: int, seed: int) -> dict[str, Any]:
-    """Work through forged states in processes of their own; a new one goes on behind a state that ended the last.
-
-    Returns the number of states by outcome, the states that ended a process, and ``held``: none did, none raised, and
-    no learner failed. ``out`` : file of one JSON line before and one after each state.
-    """
-    out.unlink(missing_ok=True)
-    crashes: list[dict[str, Any]] = []
-    first = 0
-    while first < count:
-        numbers = ("--first", str(first), "--count", str(count), "--seed", str(seed))
-        command = [sys.executable, "-m", "benchmarks.forged_states", *numbers, "--out", str(out)]
-        if subprocess.run(command, check=False).returncode == 0:
-            break
-        last = json.loads(out.read_text().splitlines()[-1])
-        crashes.append(last)
-        first = int(last["number"]) + 1
-    lines = [json.loads(line)["outcome"].split(":")[0] for line in out.read_text().splitlines()]
-    outcomes = Counter(word for word in lines if word != "begun")
-    return {
-        "states": count,
-        "outcomes": dict(outcomes),
-        "crashes": crashes,
-        "held": not crashes and set(outcomes) <= {"taken", "refused"},
-    }
+def forged(state: StateDict, rng: np.random.Generator) -> tuple[StateDict, str]:
+    """A copy of ``state`` with one to three entries replaced, and their names."""
+    # Numbers of any size are for the fuzzer.
+    kinds = [*range(len(CHANGES) + len(VALUES)), REMOVED]
+    edits = [(rng.integers(2**16), rng.choice(kinds), rng.bytes(8)) for _ in range(rng.choice([1, 1, 2, 3]))]
+    made = edited(state, b"".join(EDIT.pack(*edit) for edit in edits))
+    return made, ", ".join(name for name in state if made.get(name) is not state[name])
 
 
 def main() -> None:

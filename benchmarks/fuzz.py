@@ -45,7 +45,6 @@ def main() -> int:
     add("--live", type=float, default=30.0, metavar="S", help="fire at a live service for so long, s; 0: not (30)")
     add("--rate", type=float, default=1000.0, metavar="HZ", help="payloads a second at the live service (%(default)s)")
     add("--seed", type=int, default=1, help="of the mutations (%(default)s)")
-    add("--states", type=int, default=4000, metavar="N", help="forged states that axes take; 0: none (%(default)s)")
     add("--repeat", type=Path, metavar="FILE", help="only run the target of this crash file on it")
     add("--child", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -70,11 +69,6 @@ def main() -> int:
         "targets": targets,
     }
     held = all(target["held"] for target in targets)
-    if args.states:
-        from benchmarks.forged_states import run_in_processes
-
-        report["states"] = run_in_processes(args.out / "states.jsonl", args.states, args.seed)
-        held = held and report["states"]["held"]
     if args.live > 0.0:
         from benchmarks.fuzz_live import bombard
 
@@ -139,7 +133,7 @@ def _child(name: str, args: argparse.Namespace) -> int:
     import atheris
 
     # Modules that are imported here are instrumented, so they must not be imported yet.
-    for module in [m for m in sys.modules if m.split(".")[0] in ("dehyst", "benchmarks")]:
+    for module in [m for m in sys.modules if m.split(".")[0] in ("dehyst", "benchmarks", "tests")]:
         if module != "benchmarks.fuzz":
             del sys.modules[module]
     root = Path(__file__).resolve().parents[1]

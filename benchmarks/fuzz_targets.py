@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.forged_states import edited, make_axis, recording
-from benchmarks.small_models import small_models
 from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.service.failover.role_control import Claims
@@ -24,7 +23,6 @@ from dehyst.service.operating.verbs import Request, decode_request, encode_reque
 from dehyst.service.protocol import delta as wire_delta
 from dehyst.service.protocol import model as wire_model
 from dehyst.service.protocol import query as wire_query
-from dehyst.service.protocol import query as wire_reply
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import error_from_json, error_to_json
 from dehyst.service.protocol.keys import Keys
@@ -32,6 +30,7 @@ from dehyst.service.security.authenticator import Authenticator
 from dehyst.service.security.tokens import Holder
 from dehyst.service.stage_node.faults import decode_fault
 from dehyst.service.storage import checkpoint
+from tests.service.conftest import make_models
 
 Target = Callable[[bytes], None]
 #: What a decoder may raise on malformed bytes.
@@ -48,7 +47,7 @@ def _refusing(decode: Callable[[bytes], object]) -> Target:
 
 def _answering() -> Target:
     """A query through the whole service: decoded and answered by a model."""
-    lssvm = small_models()["lssvm_adaptive"]
+    lssvm = make_models()["lssvm_adaptive"]
     memory = lssvm.rest_memory(0.0)
 
     def target(data: bytes) -> None:
@@ -88,7 +87,7 @@ def _framed_checkpoint(data: bytes) -> None:
 
 def _changing() -> Target:
     """A payload of kind 7, taken by a follower's state of a model: decoded, added, and made a model."""
-    model = small_models()["lssvm_adaptive"]
+    model = make_models()["lssvm_adaptive"]
     base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", model, 5, model.rest_memory(1.0)))
     message = base.message()
 
@@ -162,7 +161,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "command": lambda: _refusing(wire.decode_command),
     "reference": lambda: _refusing(wire.decode_reference),
     "query": lambda: _refusing(wire_query.decode_query),
-    "reply": lambda: _refusing(wire_reply.decode_reply),
+    "reply": lambda: _refusing(wire_query.decode_reply),
     "answer": _answering,
     "model": lambda: _refusing(wire_model.decode_model),
     "delta": _changing,
@@ -179,7 +178,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
 
 def _changes() -> list[bytes]:
     """Changes of the small LSSVM: of its linear part, of its kernel part, and a whole model."""
-    old = small_models()["lssvm_adaptive"]
+    old = make_models()["lssvm_adaptive"]
     assert isinstance(old, LssvmInverse)
     memory = old.rest_memory(1.0)
     base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", old, 5, memory))
@@ -200,24 +199,24 @@ def seeds(target: str) -> list[bytes]:
     query = [
         wire_query.encode_query(40.0, 0.0),
         wire_query.encode_query(y, v, a, [1.0, 2.0], "lssvm_adaptive", 7, 1.5),
-        wire_query.encode_query(y, v, a, small_models()["lssvm_adaptive"].rest_memory(3.0)),
+        wire_query.encode_query(y, v, a, make_models()["lssvm_adaptive"].rest_memory(3.0)),
         wire_query.encode_query(y, v, a, pending=wire_query.Pending(3, y, 0.1 * y)),
     ]
-    sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in small_models().items()]
+    sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in make_models().items()]
     framed = []
     for payload in sent:
         size = struct.unpack_from("<I", payload, 16)[0]
         framed.append(size.to_bytes(2, "little") + payload[24:])
     meta = checkpoint.CheckpointMeta("demo", "x", 1e-3, 41, 40)
     kept = b"".join(checkpoint.encode_checkpoint(meta, {"a": np.arange(3.0), "name": "x", "n": 2, "b": np.eye(2)}))
-    reply = wire_reply.Answer(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
+    reply = wire_query.Answer(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
     return {
         "samples": [wire.encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, np.nan, 2.0], [3.0, 4.0, np.inf])],
         "command": [wire.encode_command(9, y)],
         "reference": [wire.encode_reference(9, y)],
         "query": query,
         "answer": query,
-        "reply": [wire_reply.encode_reply(reply)],
+        "reply": [wire_query.encode_reply(reply)],
         "model": sent,
         "delta": _changes(),
         "framed": framed,

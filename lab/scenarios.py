@@ -21,6 +21,7 @@ from dehyst.adaptive.identification import identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.reports import tables
@@ -215,14 +216,9 @@ def windows(course: ScenarioRecord) -> Windows:
     dt = course.scenario.stage.dt_s
     span = max(1, round(WINDOW_S / dt))
 
-    def moving(values: FloatArray) -> FloatArray:
-        total = np.concatenate([[0.0], np.cumsum(values)])
-        means: FloatArray = (total[span:] - total[:-span]) / span
-        return means
-
-    adaptive, frozen = (moving(np.abs(course.error_um[name])) for name in (ADAPTIVE, FROZEN))
+    adaptive, frozen = (moving_mean(np.abs(course.error_um[name]), span) for name in (ADAPTIVE, FROZEN))
     t_s: FloatArray = ((np.arange(adaptive.size) + 0.5 * span) * dt).astype(np.float64)
-    return Windows(t_s, adaptive, frozen, FACTOR * frozen + FLOORS * moving(course.floor_um))
+    return Windows(t_s, adaptive, frozen, FACTOR * frozen + FLOORS * moving_mean(course.floor_um, span))
 
 
 def judge(course: ScenarioRecord) -> Verdict:

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure and print. Returns 0. Raises InputError where there is no checkout."""
     root = Path(__file__).resolve().parents[2]
-    if not (root / "benchmarks" / "run.py").is_file():
+    if not (root / "benchmarks" / "solver.py").is_file():
         raise InputError(
             f"bench: no benchmarks/ beside the packages in {root}, expected a checkout of the sources; "
             "clone the repository and call `make bench` there"
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         sys.path.insert(0, str(root))
     if args.latency:
         return _latency(args)
-    benchmarks = importlib.import_module("benchmarks.run")
+    benchmarks = importlib.import_module("benchmarks.solver")
     if not args.json:
         print("measuring, this takes " + ("under a minute" if args.quick else "some minutes") + " ...", flush=True)
     report = benchmarks.run(quick=args.quick)

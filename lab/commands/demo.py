@@ -22,8 +22,7 @@ each model), the service that learns from one of them, a controller that follows
 viewer stream, and a bare paced loop for comparison. Each block of 5 ms is commanded one block ahead. If its voltages
 are late, the stage's clock stands still for up to 5 s: a busy machine makes the run longer and changes no voltage, and
 the end of the run says by how much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the
-stage holds the last voltage. --ahead has the controller ask the service 60 ms ahead instead. --fast runs the same plan
-in one process and gives the same voltages.
+stage holds the last voltage. --fast runs the same plan in one process and gives the same voltages.
 Displacements in µm, errors in percent of the commanded range.
 
   dehyst demo
@@ -50,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
         seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
-    add("--ahead", action="store_true", help="query the service 60 ms ahead instead of following the model")
+    add("--ahead", action="store_true", help=argparse.SUPPRESS)
     add("--view", action="store_true", help="also start the Rerun viewer and watch live (needs a display)")
     add("--connect", metavar="URL", help="also stream to a viewer that already runs, rerun+http://HOST:PORT/proxy")
     add_shared(parser, "quiet", json={"help": "print summary.json in place of the table"})
@@ -65,28 +64,17 @@ def run(args: argparse.Namespace) -> int:
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
         raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s; the table needs a settled part")
     check_seed(args.seed)
+    if args.ahead:
+        raise InputError("--ahead: removed, the controller follows its model; 'dehyst scenarios' asks the axis ahead")
     if args.fast and (args.view or args.connect):
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
-    stop = StopSignal(raising=True)
-    show = progress_printer(args.quiet)
-
-    def say(text: str) -> None:
-        stop.look()
-        show(text)
-
+    say = progress_printer(args.quiet, StopSignal(raising=True).look)
     done = session.run(
-        args.out,
-        fast=args.fast,
-        duration_s=args.duration,
-        seed=args.seed,
-        view=view,
-        say=say,
-        stage=args.stage,
-        ahead=args.ahead,
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage,
         strict=args.strict,
-    )
+    )  # fmt: skip
     if args.json:
         print(json.dumps(done.summary))
     else:
@@ -99,15 +87,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _controlled(summary: dict[str, Any]) -> str:
     """What the controller did, in one line."""
-    queries, found = summary["queries"], summary["followed"]
-    times = f"median {queries['p50_us']:.0f} µs, 99 % within {queries['p99_us']:.0f} µs"
-    if not found:
-        return f"queries: {queries['count']}, {times}, {queries['late']} too late"
+    blocks, found = summary["queries"], summary["followed"]
     return (
-        f"blocks evaluated by the followed model: {queries['count']}, {times}; its last sample was "
-        f"{found['age_p50_ms']:.0f} ms (99 %: {found['age_p99_ms']:.0f} ms) old when a block began; "
-        f"{found['late_models']} blocks with an older model than planned, "
-        f"{found['lost']} changes lost and {found['repairs']} repaired; "
+        f"blocks evaluated by the followed model: {blocks['count']}, median {blocks['p50_us']:.0f} µs, 99 % within "
+        f"{blocks['p99_us']:.0f} µs; its last sample was {found['age_p50_ms']:.0f} ms (99 %: "
+        f"{found['age_p99_ms']:.0f} ms) old when a block began; {found['late_models']} blocks with an older model than "
+        f"planned, {found['lost']} changes lost and {found['repairs']} repaired; "
         f"{found['extrapolated']} voltages from the reserve of an earlier block"
     )
 
@@ -120,12 +105,7 @@ def _run_mirror(args: argparse.Namespace) -> int:
     from dehyst.lab.demo import mirror
     from dehyst.sim.mirror import MirrorConfig
 
-    stop, show = StopSignal(raising=True), progress_printer(args.quiet)
-
-    def say(text: str) -> None:
-        stop.look()
-        show(text)
-
+    say = progress_printer(args.quiet, StopSignal(raising=True).look)
     config = MirrorConfig(side=args.side, seed=args.seed)
     summary = mirror.run(args.out, config, args.duration, say)
     if args.json:

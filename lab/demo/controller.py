@@ -1,4 +1,4 @@
-"""The controller: follows the models or asks the service ahead, sends voltages, records the readings.
+"""The controller: follows the models, sends voltages, records the readings.
 
 ``python -m dehyst.lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it computes a
 block when the stage has published the tick that the plan gives. Progress goes to standard output as lines of JSON.
@@ -25,9 +25,9 @@ from dehyst.lab.testbed.processes import run_client_process
 from dehyst.service.client.client import Client, PendingCommands
 from dehyst.service.client.follower import Follower
 from dehyst.service.protocol import samples as wire
-from dehyst.service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
+from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
+from dehyst.service.protocol.query import FeedforwardQuery
 from dehyst.service.runtime.session import SURELY, open_client, wait_followed
 from dehyst.service.security.authenticator import own_authenticator
 from dehyst.service.security.lease import CommandLease
@@ -137,10 +137,8 @@ class FollowedModels:
 
 #: How long to wait for the stage's next samples, s.
 STALL_S = 10.0
-#: How long to wait for the model that a block is planned with, s: the stage's clock stands still meanwhile, or does not
-#: (followed, queried).
-MODEL_S = 0.5
-STRICT_MODEL_S, STRICT_QUERY_S = 0.002, 0.1
+#: How long to wait for the model that a block is planned with, s; with ``strict`` the stage's clock runs meanwhile.
+MODEL_S, STRICT_MODEL_S = 0.5, 0.002
 #: States of a followed model that are kept.
 KEPT = 64
 #: Ticks of the reference that are published at once.
@@ -193,7 +191,9 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
         followers = {name: client.follow(name, keep=KEPT if name == TEACHER else 1) for name in MODELS}
         models = FollowedModels(plan, followers)
         twins = Twins(plan, session)
-        commands, event = _publishers(session)
+        by = own_authenticator()
+        commands = {name: CommandLease(session, Keys(STAGE, UNITS[name]), by) for name in MODELS}
+        event = session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
         try:
             _wait_for_stage(commands)
             block = 0
@@ -217,7 +217,9 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
                     part = slice(done * size // TOLD * TOLD, min(block * size // TOLD * TOLD, n))
                     client.reference(part.start, wanted[0][part])
                 if done * size <= plan.change_tick < block * size:
-                    _tell_change(event, plan)
+                    # For the viewer only: the service must find out by itself.
+                    told = {"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text}
+                    event.put(json.dumps(told))
                 if block * size // 1000 > done * size // 1000:
                     _report(plan, wanted[0], twins, max(0, min(seen, done * size - plan.lead)))
             complete = twins.wait(n)
@@ -227,16 +229,11 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
                 lease.undeclare()
             event.undeclare()  # type: ignore[no-untyped-call]
         counts = models.counts()
-    _write(out, twins, models.std_V, models.durations_s, int(counts["late_models"]), counts)
+    kinds = {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": models.std_V}
+    arrays: dict[str, Any] = {f"{kind}/{name}": values[name] for kind, values in kinds.items() for name in MODELS}
+    np.savez(out, query_s=np.asarray(models.durations_s), followed=json.dumps(counts), **arrays)
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
-
-
-def _publishers(session: zenoh.Session) -> tuple[dict[str, CommandLease], zenoh.Publisher]:
-    """Leases to command the twins, by model, and the publisher of events."""
-    by = own_authenticator()
-    commands = {name: CommandLease(session, Keys(STAGE, UNITS[name]), by) for name in MODELS}
-    return commands, session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
 
 
 def _wait_for_stage(commands: dict[str, CommandLease]) -> None:
@@ -248,82 +245,8 @@ def _wait_for_stage(commands: dict[str, CommandLease]) -> None:
             raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
 
 
-def _tell_change(event: zenoh.Publisher, plan: Plan) -> None:
-    """For the viewer only: the service must find out by itself."""
-    event.put(json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text}))
-
-
-def _write(
-    out: Path, twins: Twins, std_V: dict[str, FloatArray], durations: list[float], late: int, counts: dict[str, float]
-) -> None:
-    kinds = {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": std_V}
-    arrays: dict[str, Any] = {f"{kind}/{name}": values[name] for kind, values in kinds.items() for name in MODELS}
-    np.savez(out, query_s=np.asarray(durations), late=late, followed=json.dumps(counts), **arrays)
-
-
-def control(plan: Plan, endpoint: str, out: Path) -> int:
-    """Run the plan by queries ahead of time; else as `follow`."""
-    wanted = plan.reference()
-    n, size = plan.ticks, plan.block
-    std_V = empty(plan)
-    durations: list[float] = []
-    late = 0  # answers after their block was due, or from another snapshot than planned
-    answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
-    # The first answers precede all samples, and the first commands start the stage's clock: these commands are held
-    # until all such answers are there.
-    blind = sum(plan.as_of(block) < 0 for block in range(n // size))
-    held: list[tuple[CommandLease, bytes]] = []
-    # Two sessions, so that an answer does not wait behind the samples of five twins.
-    with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
-        twins = Twins(plan, session)
-        commands, event = _publishers(session)
-        try:
-            _wait_for_stage(commands)
-            stop = 0
-            while stop < n // size:
-                block = stop
-                if not twins.wait(block * size - plan.lead):
-                    print(json.dumps({"stalled": block * size}), flush=True)
-                    return 1
-                fresh, stop = blocks_now(plan, block, twins.seen[TEACHER])
-                part = slice(block * size, stop * size)
-                client.reference(part.start, wanted[0][part])
-                for name in MODELS:
-                    begin = time.perf_counter()
-                    # The service tracks the teacher's stage; the other models carry their memory in the query, without
-                    # gaps.
-                    due = fresh * size if name == TEACHER else None
-                    asked = slice(part.start if due is None else due, part.stop)
-                    motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
-                    wait_s = STRICT_QUERY_S if plan.strict else MODEL_S
-                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), wait_s, due)
-                    late += waited
-                    durations.append(time.perf_counter() - begin)
-                    answers[name] = answer
-                    std_V[name][asked] = answer.std_V
-                    held.append((commands[name], wire.encode_command(asked.start, answer.u_V)))
-                    if block >= blind or len(held) == blind * len(MODELS):
-                        for lease, command in held:
-                            lease.put(command)
-                        held.clear()
-                late += twins.seen[TEACHER] > part.start
-                if part.start <= plan.change_tick < part.stop:
-                    _tell_change(event, plan)
-                if part.stop // 1000 > part.start // 1000:
-                    _report(plan, wanted[0], twins, max(0, part.start - plan.lead))
-            complete = twins.wait(n)
-        finally:
-            twins.close()
-            for lease in commands.values():
-                lease.undeclare()
-            event.undeclare()  # type: ignore[no-untyped-call]
-    _write(out, twins, std_V, durations, late, {})
-    print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
-    return 0 if complete else 1
-
-
 def blocks_now(plan: Plan, block: int, seen: int) -> tuple[int, int]:
-    """(fresh, stop) after ``seen`` samples: ask for the blocks before ``stop`` instead of only ``block``.
+    """(fresh, stop) after ``seen`` samples: command the blocks before ``stop`` instead of only ``block``.
 
     In time this is one block. Otherwise all blocks up to the one that would be due now, or a controller that was late
     once would stay late. What is before block ``fresh`` is past already and of no use.
@@ -333,33 +256,6 @@ def blocks_now(plan: Plan, block: int, seen: int) -> tuple[int, int]:
         return block, block + 1
     last = plan.ticks // size
     return min(-(-seen // size), last - 1), min((seen + plan.lead) // size + 1, last)
-
-
-def ask(
-    client: Client,
-    motion: tuple[FloatArray, FloatArray, FloatArray],
-    model: str,
-    after: Trajectory | None,
-    as_of: int,
-    wait_s: float,
-    begin: int | None = None,
-) -> tuple[Trajectory, bool]:
-    """The voltages for a block, and whether they had to be asked for more than once.
-
-    If the machine stalls, the controller asks again and accepts the newest snapshot if the planned one is not there in
-    time. Raises what the client raises after ``STALL_S``.
-    """
-    until = time.monotonic() + STALL_S
-    wanted, waited = as_of, False
-    while True:
-        try:
-            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=wait_s)
-            return answer, waited
-        except (BehindError, ReplyTimeoutError, RefusedError) as error:
-            too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST
-            if time.monotonic() >= until or (isinstance(error, RefusedError) and not too_old):
-                raise
-            wanted, waited = NEWEST, True
 
 
 def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
@@ -372,8 +268,7 @@ def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
     plan = Plan(**json.loads(Path(argv[0]).read_text()))
-    run = control if plan.ahead else follow
-    return run_client_process(lambda: run(plan, argv[1], Path(argv[2])))
+    return run_client_process(lambda: follow(plan, argv[1], Path(argv[2])))
 
 
 if __name__ == "__main__":

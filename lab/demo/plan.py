@@ -5,10 +5,10 @@ Time line of one run (ticks of ``dt_s``)::
     block j covers the ticks [jB, (j+1)B); it is computed when the stage has published tick jB - lead - 1,
     by the newest model that has seen no sample after jB - lead - margin.
 
-The controller follows the model and evaluates it itself; with ``ahead`` it queries the service, which takes longer. The
-margin gives the samples time to be learnt, and the model time to arrive, so that a run in real time and a fast one use
-the same models and get the same voltages. Each block of a followed model also commands the ``reserve`` ticks after it:
-where the controller stalls, the stage goes on along the reference by a model that is as much older.
+The controller follows the model and evaluates it itself. The margin gives the samples time to be learnt, and the model
+time to arrive, so that a run in real time and a fast one use the same models and get the same voltages. Each block also
+commands the ``reserve`` ticks after it: where the controller stalls, the stage goes on along the reference by a model
+that is as much older.
 
 That is with ``strict``. Otherwise stage and controller wait for each other, up to ``LOCK_STEP_S``: a busy machine makes
 the run longer, not its voltages late, and a reserve is not needed.
@@ -43,8 +43,6 @@ MODELS: dict[str, str] = {
 #: The model from whose stage the service learns.
 TEACHER = "lssvm_adaptive"
 STAGE, AXIS = "demo", "x"
-#: Fields of a plan whose controller queries ahead.
-ASKING_AHEAD = {"ahead": True, "block": 20, "lead": 60, "margin": 20}
 #: Ticks of the reserve of a controller that follows a model in real time.
 RESERVE = 60
 #: Ticks between two snapshots of the service.
@@ -64,9 +62,8 @@ class Plan:
     dt_s : sample time, s. identify_s, run_s : lengths of the two parts, s.
     gain_change, payload_ratio : relative change of the stage's gain half way through; mass added over mass moved.
     low_um, high_um : range of the reference, µm.
-    ahead : query the service ahead of time instead of following the model.
     block, lead, margin : ticks per block, ticks that it is computed ahead, ticks left for samples and model to arrive.
-    reserve : ticks after each block that are commanded as well; only with ``strict``, and not with ``ahead``.
+    reserve : ticks after each block that are commanded as well; only with ``strict``.
     strict : the stage's clock keeps real time, also where a voltage is late.
     seed : of the stage's noise and of the reference.
     drive_low_V, drive_high_V : range of the identification signal, V.
@@ -83,7 +80,6 @@ class Plan:
     payload_ratio: float = 1.0
     low_um: float = 4.0
     high_um: float = 80.0
-    ahead: bool = False
     block: int = 5
     lead: int = 5
     margin: int = 10
@@ -103,7 +99,7 @@ class Plan:
 
     @property
     def ticks(self) -> int:
-        """Length of the second part in ticks, whole blocks of either way."""
+        """Length of the second part in ticks, whole snapshots."""
         return round(self.run_s / self.dt_s) // SNAPSHOT_EVERY * SNAPSHOT_EVERY
 
     @property
@@ -169,10 +165,9 @@ class Plan:
         return replace(config, changes=(*config.changes, (at_s, change)))
 
 
-def make_plan(run_s: float, seed: int, ahead: bool = False, strict: bool = False) -> Plan:
+def make_plan(run_s: float, seed: int, strict: bool = False) -> Plan:
     """The plan on the usual stage."""
-    base = Plan(run_s=run_s, seed=seed, strict=strict, reserve=RESERVE if strict and not ahead else 0)
-    return replace(base, **ASKING_AHEAD) if ahead else base  # type: ignore[arg-type]
+    return Plan(run_s=run_s, seed=seed, strict=strict, reserve=RESERVE if strict else 0)
 
 
 # --- Fits the plan of the demonstration to a stage from a file, by measuring the stage.
@@ -183,13 +178,13 @@ DRIVE_SHARE, LOW_SHARE, HIGH_SHARE = 0.8, 0.045, 0.9
 QUICK_S = 4e-3
 
 
-def plan_for(path: Path, folder: Path, run_s: float, seed: int, ahead: bool = False, strict: bool = False) -> Plan:
+def plan_for(path: Path, folder: Path, run_s: float, seed: int, strict: bool = False) -> Plan:
     """The plan for the stage in the file ``path``; the stage that is run is written into ``folder``.
 
     Voltages stay within ``DRIVE_SHARE`` of the file's limits; the commanded range is a share of what they reach. The
     sample time is the plan's own. Raises InputError if the stage does not move, or diverges.
     """
-    base = make_plan(run_s, seed, ahead, strict)
+    base = make_plan(run_s, seed, strict)
     config = replace(_able_to_drift(_from_zero(load_stage(path))), dt_s=base.dt_s, seed=seed)
     high = DRIVE_SHARE * config.u_max_V
     # A stage of one polarity keeps it; a bipolar stage is driven both ways.

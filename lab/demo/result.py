@@ -10,6 +10,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.demo.plan import MODELS, Plan
+from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.reports.plot_style import figure, line, save
 from dehyst.service.viewer.colours import EVENT, REFERENCE, model_colour
 
@@ -39,17 +40,13 @@ def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
 
 def worst_stretch(error_um: FloatArray, plan: Plan) -> dict[str, float]:
     """Largest mean absolute error over ``WORST_S`` of the whole run, percent of the range, and where it begins, s."""
-    n = round(WORST_S / plan.dt_s)
-    sums = np.concatenate(([0.0], np.cumsum(np.abs(error_um))))
-    means = (sums[n:] - sums[:-n]) / n
+    means = moving_mean(np.abs(error_um), round(WORST_S / plan.dt_s))
     at = int(np.argmax(means))
     return {"mae_pct": float(100.0 * means[at] / plan.range_um), "t_s": at * plan.dt_s}
 
 
-def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
-    """Round trips of queries: count, median and 99th percentile in µs, and how many came too late."""
-    if seconds.size == 0:
-        return {"count": 0, "p50_us": None, "p99_us": None, "late": late}
+def evaluations(seconds: FloatArray, late: float) -> dict[str, Any]:
+    """Evaluations of a block: count, median and 99th percentile in µs, and how many had an older model than planned."""
     p50, p99 = np.percentile(seconds * 1e6, [50, 99])
     return {"count": int(seconds.size), "p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1), "late": late}
 
@@ -113,11 +110,10 @@ class DemoRun:
     Attributes
     ----------
     y_um, u_V, std_V : by model, (ticks,); the reading, the voltage applied, its standard deviation.
-    query_s : durations of the feedforward queries, s. late_queries : answers after their block was due.
+    query_s : durations of the evaluations of a block, s. followed : of the learning model, see `FollowedModels.counts`.
     samples : counts ``sent``, ``received``, ``learnt`` of the stage that the service learns from.
     ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
     notes : records for the viewer (events, diagnostics, status), in order.
-    followed : of a followed model, see `Followed.counts`; empty where the service was queried ahead.
     pace : of a run with a clock, s: ``stage_s`` of the stage's time, ``ran_s`` that it took, and ``waited_s`` for which
     the stage's clock stood still. Empty without a clock.
     """
@@ -126,11 +122,10 @@ class DemoRun:
     u_V: dict[str, FloatArray]
     std_V: dict[str, FloatArray]
     query_s: FloatArray
-    late_queries: int
     samples: dict[str, int]
     ticks: dict[str, int]
+    followed: dict[str, float]
     notes: list[Any] = field(default_factory=list)
-    followed: dict[str, float] = field(default_factory=dict)
     pace: dict[str, float] = field(default_factory=dict)
 
     def summary(self, plan: Plan, reference_um: FloatArray) -> dict[str, Any]:
@@ -141,9 +136,8 @@ class DemoRun:
             "models": {name: score(reference_um - self.y_um[name], plan) for name in MODELS},
             "seconds": {name: [part.start * plan.dt_s, part.stop * plan.dt_s] for name, part in plan.phases().items()},
             "worst_half_second": {name: worst_stretch(reference_um - self.y_um[name], plan) for name in MODELS},
-            "controller": "queries ahead" if plan.ahead else "follows the model",
             "followed": self.followed,
-            "queries": latency(self.query_s, self.late_queries),
+            "queries": evaluations(self.query_s, self.followed["late_models"]),
             "samples": self.samples,
             "ticks": self.ticks,
             "pace": self.pace,

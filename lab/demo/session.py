@@ -14,7 +14,6 @@ import numpy as np
 import zenoh
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.types import FloatArray
 from dehyst.lab.demo.controller import KEPT, FollowedModels
 from dehyst.lab.demo.plan import (
     AXIS,
@@ -28,8 +27,8 @@ from dehyst.lab.demo.plan import (
     make_plan,
     plan_for,
 )
-from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
-from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking
+from dehyst.lab.loop import Twins, samples, turns
 from dehyst.lab.testbed.identified_stage import READY_S, Rig, write_service_config
 from dehyst.lab.testbed.processes import Child
 from dehyst.service.client.client import Client
@@ -135,7 +134,7 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
 def _stage_options(plan: Plan, ticks: int, *, changing: bool) -> list[str]:
     options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(ticks * plan.dt_s)]
     options += ["--file", plan.stage_file] if plan.stage_file else []
-    options += ["--batch", str(1 if plan.ahead else plan.block)]
+    options += ["--batch", str(plan.block)]
     options += [] if plan.strict else ["--lock-step", repr(LOCK_STEP_S)]
     for t_s, values in plan.stage(changing=changing).changes:
         options += ["--change", f"{t_s!r}:" + ",".join(f"{name}={value!r}" for name, value in values.items())]
@@ -172,7 +171,7 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
 def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     with np.load(result) as kept:
         y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
-        query_s, late, followed = kept["query_s"], int(kept["late"]), json.loads(str(kept["followed"]))
+        query_s, followed = kept["query_s"], json.loads(str(kept["followed"]))
     result.unlink()
     summary = stage.last_json()
     units = summary["units"]
@@ -186,9 +185,7 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     }
     stage_s = summary["tick"] * summary["dt_s"]
     pace = {"stage_s": stage_s, "ran_s": summary["ran_s"], "waited_s": summary["waited_s"]}
-    return DemoRun(
-        y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks, followed=followed, pace=pace
-    )
+    return DemoRun(y_um, u_V, std_V, query_s, samples, ticks, followed, pace=pace)
 
 
 # --- In one process, as fast as possible: the same models, queries and answers, without a network.
@@ -229,18 +226,13 @@ class _Samples:
             errors = {k: float(np.mean(np.abs(self._wanted_um[tail] - self.y_um[k][tail]))) for k in MODELS}
             self._progress(done + size, errors)
 
-    def result(self, std_V: dict[str, FloatArray], durations: list[float], followed: dict[str, float]) -> DemoRun:
+    def result(self, models: FollowedModels) -> DemoRun:
         """The run."""
-        axis, n = self._axis, self._plan.ticks
+        n, axis = self._plan.ticks, self._axis
         samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
         ticks = {"count": n, "late": 0, "bare_late": 0}
-        return DemoRun(self.y_um, self.u_V, std_V, np.asarray(durations), 0, samples, ticks, self.notes, followed)
-
-
-def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
-    """Run the plan on twin stages; the teacher's samples go into ``axis``."""
-    driven = _Samples(plan, axis, recorder, progress)
-    return (_queried if plan.ahead else _followed)(plan, axis, driven)
+        durations = np.asarray(models.durations_s)
+        return DemoRun(self.y_um, self.u_V, models.std_V, durations, samples, ticks, models.counts(), self.notes)
 
 
 class _Loopback:
@@ -260,8 +252,12 @@ class _Loopback:
             self._deliver(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
 
 
-def _followed(plan: Plan, axis: Axis, driven: _Samples) -> DemoRun:
-    """By followers that get their models as in real time, message by message."""
+def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
+    """Run the plan on twin stages, by followers that get their models as in real time, message by message.
+
+    The teacher's samples go into ``axis``.
+    """
+    driven = _Samples(plan, axis, recorder, progress)
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
     loopback, streams = _Loopback(), DeltaStreams(axis)
     streams.publish(TEACHER, loopback.put, lambda: True)
@@ -285,29 +281,7 @@ def _followed(plan: Plan, axis: Axis, driven: _Samples) -> DemoRun:
                 driven.u_V[name][begin : begin + u_V.size] = u_V
             begin, u_V = models.block(asked, asked, asked + 1)
             driven.u_V[TEACHER][begin : begin + u_V.size] = u_V
-    return driven.result(models.std_V, models.durations_s, models.counts())
-
-
-def _queried(plan: Plan, axis: Axis, driven: _Samples) -> DemoRun:
-    """By queries ahead of time."""
-    wanted = plan.reference()
-    n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
-    std_V = empty(plan)
-    # The service tracks the teacher's stage; the other models carry their memory in the query.
-    ask = {name: Asker(axis, name, tracked=name == TEACHER) for name in MODELS}
-    durations = []
-    for run, asked in turns(n // size, ahead):
-        if run is not None:
-            driven.drive(run)
-        if asked is None:
-            continue
-        part = slice(asked * size, (asked + 1) * size)
-        for name in MODELS:
-            begin = time.perf_counter()
-            reply = ask[name](part.start, [column[part] for column in wanted], plan.as_of(asked))
-            durations.append(time.perf_counter() - begin)
-            driven.u_V[name][part], std_V[name][part] = reply.u_V, reply.std_V
-    return driven.result(std_V, durations, {})
+    return driven.result(models)
 
 
 Say = Callable[[str], None]
@@ -333,13 +307,11 @@ def run(
     view: list[str],
     say: Say,
     stage: Path | None = None,
-    ahead: bool = False,
     strict: bool = False,
 ) -> Done:
     """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
 
-    ``ahead`` : the controller queries the service ahead of time instead of following the model. ``strict`` : the
-    stage's clock waits for no voltage.
+    ``strict`` : the stage's clock waits for no voltage.
 
     Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
@@ -347,7 +319,7 @@ def run(
     clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
-    how = (duration_s, seed, ahead, strict)
+    how = (duration_s, seed, strict)
     plan = make_plan(*how) if own is None else plan_for(own, logs, *how)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
     _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))

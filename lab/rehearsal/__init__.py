@@ -9,47 +9,23 @@ See docs/rehearse.md.
 """
 
 from dehyst.lab.rehearsal.config import RehearsalConfig
-from dehyst.lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, INTACT, SENSOR, STANDARD, Event, draw
-from dehyst.lab.rehearsal.outcome import ErrorFigures, HealthyOutcome, Outcome, Trouble
-from dehyst.lab.rehearsal.plant import (
-    Change,
-    Changeable,
-    FunctionPlant,
-    IdentifiedPlant,
-    Plant,
-    PlantFactory,
-    factory_of,
-    identify,
-)
-from dehyst.lab.rehearsal.reference import Motion, RandomReference, Reference, ReferenceRequest
-from dehyst.lab.rehearsal.rehearsal import EventRun, Rehearsal, rehearse, run_event, run_healthy, standard_events
-from dehyst.lab.rehearsal.runs import LoopRecord
+from dehyst.lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, SENSOR, STANDARD, Event, draw
+from dehyst.lab.rehearsal.plant import Change, IdentifiedPlant, PlantFactory, factory_of, identify
+from dehyst.lab.rehearsal.reference import Motion, RandomReference
+from dehyst.lab.rehearsal.rehearsal import rehearse, run_event, run_healthy, standard_events
 
 __all__ = [
     "CLASSES",
     "EVENT_KINDS",
-    "INTACT",
     "SENSOR",
     "STANDARD",
     "Change",
-    "Changeable",
-    "ErrorFigures",
     "Event",
-    "EventRun",
-    "FunctionPlant",
-    "HealthyOutcome",
     "IdentifiedPlant",
-    "LoopRecord",
     "Motion",
-    "Outcome",
-    "Plant",
     "PlantFactory",
     "RandomReference",
-    "Reference",
-    "ReferenceRequest",
-    "Rehearsal",
     "RehearsalConfig",
-    "Trouble",
     "draw",
     "factory_of",
     "identify",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,51 +25,133 @@ INTACT: Final = "intact"
 SENSOR: Final = "sensor"
 
 
-class EventKind(NamedTuple):
-    """A kind of event. category : INTACT or SENSOR. where : what it acts on. unit : of ``Event.size``. text :
-    description."""
-
-    category: str
-    where: str
-    unit: str
-    text: str
-
-
 #: What an event acts on.
 NOTHING, PHYSICS, READING, MESSAGE, REFERENCE = "nothing", "physics", "reading", "message", "reference"
 
+#: Draws a number; the second argument is a random sign, 1 or -1.
+Draw = Callable[[np.random.Generator, float], float]
+
+
+def _value(value: float) -> Draw:
+    return lambda rng, sign: value
+
+
+def _uniform(low: float, high: float) -> Draw:
+    return lambda rng, sign: float(rng.uniform(low, high))
+
+
+def _even(low: float, high: float) -> Draw:
+    """All decades of the range alike."""
+    return lambda rng, sign: float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _signed(draw: Draw) -> Draw:
+    return lambda rng, sign: sign * draw(rng, sign)
+
+
+def _one_of(*values: float) -> Draw:
+    return lambda rng, sign: values[int(rng.integers(len(values)))]
+
+
+def _far_off(rng: np.random.Generator, _sign: float) -> float:
+    """A factor well below or well above one."""
+    return _even(0.01, 0.5)(rng, 1.0) if rng.uniform() < 0.5 else float(rng.uniform(1.6, 3.0))
+
+
+class EventKind(NamedTuple):
+    """A kind of event.
+
+    category : INTACT or SENSOR. where : what it acts on. text : description. size, over_s : draw ``Event.size`` and
+    ``Event.over_s`` where its class does not state them. said : how the size is said, and by what it is multiplied
+    first; ``comes`` : it comes within ``over_s`` and stays; else it lasts that long.
+    """
+
+    category: str
+    where: str
+    text: str
+    size: Draw = _value(0.0)
+    over_s: Draw = _value(0.0)
+    said: str = ""
+    times: float = 1.0
+    comes: bool = False
+
+
+_BRIEF, _LONG = _uniform(1.0, 3.0), _uniform(2.0, 5.0)
+_OF_RANGE: Final = ", {:.3g} % of the range"
+#: Jumps of the sample count that are drawn; the largest leaves room for numbers after it.
+_JUMPS: Final = (1000.0, 100_000.0, float(2**62 - 2**40))
 #: Kinds of events by name. "range" is the commanded range, peak to peak.
 EVENT_KINDS: Final[dict[str, EventKind]] = {
-    "none": EventKind(INTACT, NOTHING, "", "nothing happens"),
-    "gain": EventKind(INTACT, PHYSICS, "share of the gain", "the stage's gain changes"),
-    "zero": EventKind(INTACT, PHYSICS, "share of the range", "the stage's zero shifts"),
-    "payload": EventKind(INTACT, PHYSICS, "share of the moved mass", "a payload is put on"),
-    "lag": EventKind(INTACT, PHYSICS, "s", "the amplifier becomes slower"),
-    "knock": EventKind(INTACT, PHYSICS, "share of the range", "somebody touches the table: the stage rings"),
-    "hum": EventKind(INTACT, READING, "share of the range", "mains hum on the reading"),
-    "spikes": EventKind(INTACT, READING, "share of the range", "single readings are wrong, ten a second"),
-    "bursts": EventKind(INTACT, READING, "share of the range", "readings are wrong for a few ms, three times a second"),
-    "gap": EventKind(INTACT, MESSAGE, "", "no samples are sent"),
-    "losses": EventKind(INTACT, MESSAGE, "share of the samples", "samples are lost at random"),
-    "duplicates": EventKind(INTACT, MESSAGE, "share of the samples", "samples come twice"),
-    "reversed": EventKind(INTACT, MESSAGE, "", "the samples of a message come in reverse order"),
-    "number_jump": EventKind(INTACT, MESSAGE, "numbers", "the count of the samples jumps and goes on from there"),
-    "number_stray": EventKind(INTACT, MESSAGE, "numbers", "one sample has a number far ahead"),
-    "clock": EventKind(INTACT, MESSAGE, "s", "the stage's clock is set"),
-    "rail": EventKind(INTACT, REFERENCE, "", "the reference asks for more than the stage reaches"),
-    "stuck": EventKind(SENSOR, READING, "", "the sensor repeats one reading"),
-    "stuck_noise": EventKind(SENSOR, READING, "share of the range, rms", "the sensor shows one place and noise"),
-    "sensor_gain": EventKind(SENSOR, READING, "factor", "the sensor shows a multiple of the motion"),
-    "sign": EventKind(SENSOR, READING, "", "the sensor's sign is flipped"),
-    "foreign": EventKind(SENSOR, READING, "", "the readings are those of another stage"),
-    "units": EventKind(SENSOR, MESSAGE, "", "voltages come in mV and readings in nm"),
-    "exchanged": EventKind(SENSOR, MESSAGE, "", "voltages and readings come in each other's place"),
-    "u_sign": EventKind(SENSOR, MESSAGE, "", "the voltages' sign is flipped"),
-    "u_constant": EventKind(SENSOR, MESSAGE, "", "the voltage of one sample is repeated"),
-    "u_late": EventKind(SENSOR, MESSAGE, "s", "the voltages are those of earlier samples"),
-    "u_scaled": EventKind(SENSOR, MESSAGE, "factor", "the voltages are a multiple of those that were applied"),
-    "other_stage": EventKind(SENSOR, MESSAGE, "s", "the samples are those of a like stage that is later by some time"),
-}
+    "none": EventKind(INTACT, NOTHING, "nothing happens"),
+    "gain": EventKind(
+        INTACT, PHYSICS, "the stage's gain changes", _signed(_uniform(0.03, 0.12)), said=" by {:+.3g} %", times=100.0,
+        comes=True,
+    ),
+    "zero": EventKind(
+        INTACT, PHYSICS, "the stage's zero shifts", _signed(_uniform(0.01, 0.08)), said=" by {:+.3g} % of the range",
+        times=100.0, comes=True,
+    ),
+    "payload": EventKind(
+        INTACT, PHYSICS, "a payload is put on", _uniform(0.3, 2.0), said=", {:.3g} times the moved mass", comes=True
+    ),
+    "lag": EventKind(
+        INTACT, PHYSICS, "the amplifier becomes slower", _even(2e-4, 3e-3), said=" by {:.3g} ms", times=1e3, comes=True
+    ),
+    "knock": EventKind(
+        INTACT, PHYSICS, "somebody touches the table: the stage rings", _even(0.01, 0.05), said=_OF_RANGE, times=100.0
+    ),
+    "hum": EventKind(INTACT, READING, "mains hum on the reading", _even(5e-4, 0.01), _BRIEF, _OF_RANGE, 100.0),
+    "spikes": EventKind(
+        INTACT, READING, "single readings are wrong, ten a second", _even(0.005, 1.0), _BRIEF, _OF_RANGE, 100.0
+    ),
+    "bursts": EventKind(
+        INTACT, READING, "readings are wrong for a few ms, three times a second", _even(0.005, 1.0), _BRIEF, _OF_RANGE,
+        100.0,
+    ),
+    "gap": EventKind(INTACT, MESSAGE, "no samples are sent", over_s=_even(0.01, 3.0)),
+    "losses": EventKind(
+        INTACT, MESSAGE, "samples are lost at random", _uniform(0.3, 0.95), _uniform(1.0, 4.0), ", {:.3g} % of them",
+        100.0,
+    ),
+    "duplicates": EventKind(
+        INTACT, MESSAGE, "samples come twice", _uniform(0.2, 1.0), _BRIEF, ", {:.3g} % of them", 100.0
+    ),
+    "reversed": EventKind(
+        INTACT, MESSAGE, "the samples of a message come in reverse order", over_s=_uniform(0.5, 2.0)
+    ),
+    "number_jump": EventKind(
+        INTACT, MESSAGE, "the count of the samples jumps and goes on from there", _one_of(*_JUMPS), said=" by {:.8g}"
+    ),
+    "number_stray": EventKind(
+        INTACT, MESSAGE, "one sample has a number far ahead", _one_of(*_JUMPS[:2], float(2**62)), said=" by {:.8g}"
+    ),
+    "clock": EventKind(INTACT, MESSAGE, "the stage's clock is set", _signed(_even(0.01, 1e6)), said=" by {:+.3g} s"),
+    "rail": EventKind(INTACT, REFERENCE, "the reference asks for more than the stage reaches", over_s=_value(1.0)),
+    "stuck": EventKind(SENSOR, READING, "the sensor repeats one reading", over_s=_LONG),
+    "stuck_noise": EventKind(
+        SENSOR, READING, "the sensor shows one place and noise", _even(1e-9, 3e-5), _LONG, " of {:.1g} of the range"
+    ),
+    "sensor_gain": EventKind(
+        SENSOR, READING, "the sensor shows a multiple of the motion", _far_off, _uniform(2.0, 8.0), " by {:.3g}"
+    ),
+    "sign": EventKind(SENSOR, READING, "the sensor's sign is flipped", over_s=_LONG),
+    "foreign": EventKind(SENSOR, READING, "the readings are those of another stage", over_s=_LONG),
+    "units": EventKind(SENSOR, MESSAGE, "voltages come in mV and readings in nm", over_s=_LONG),
+    "exchanged": EventKind(SENSOR, MESSAGE, "voltages and readings come in each other's place", over_s=_LONG),
+    "u_sign": EventKind(SENSOR, MESSAGE, "the voltages' sign is flipped", over_s=_LONG),
+    "u_constant": EventKind(SENSOR, MESSAGE, "the voltage of one sample is repeated", over_s=_LONG),
+    "u_late": EventKind(
+        SENSOR, MESSAGE, "the voltages are those of earlier samples", _even(0.005, 0.05), _LONG, " by {:.3g} ms", 1e3
+    ),
+    "u_scaled": EventKind(
+        SENSOR, MESSAGE, "the voltages are a multiple of those that were applied",
+        lambda rng, sign: float(rng.uniform(1.5, 3.0)) ** sign, _LONG, " by {:.3g}",
+    ),
+    "other_stage": EventKind(
+        SENSOR, MESSAGE, "the samples are those of a like stage that is later by some time", _even(0.2, 1.5), _LONG,
+        " by {:.3g} ms", 1e3,
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,36 +203,11 @@ class Event:
     @property
     def text(self) -> str:
         """Description with size and duration."""
-        return f"{EVENT_KINDS[self.kind].text}{_sized(self)}{_when(self)}"
-
-
-def _sized(event: Event) -> str:
-    kind, size = event.kind, event.size
-    if kind in ("gain", "zero"):
-        return f" by {100.0 * size:+.3g} %" + (" of the range" if kind == "zero" else "")
-    if kind in ("knock", "hum", "spikes", "bursts"):
-        return f", {100.0 * size:.3g} % of the range"
-    if kind == "payload":
-        return f", {size:.3g} times the moved mass"
-    if kind == "lag":
-        return f" by {1e3 * size:.3g} ms"
-    if kind == "stuck_noise":
-        return f" of {size:.1g} of the range"
-    if kind in ("u_late", "other_stage"):
-        return f" by {1e3 * size:.3g} ms"
-    if kind in ("sensor_gain", "u_scaled"):
-        return f" by {size:.3g}"
-    if kind in ("losses", "duplicates"):
-        return f", {100.0 * size:.3g} % of them"
-    if kind in ("number_jump", "number_stray"):
-        return f" by {size:.8g}"
-    return f" by {size:+.3g} s" if kind == "clock" else ""
-
-
-def _when(event: Event) -> str:
-    if event.kind in ("gain", "zero", "payload", "lag"):
-        return f", within {event.over_s:g} s" if event.over_s else ", at once"
-    return f", for {event.over_s:.2g} s" if event.over_s else ""
+        kind = EVENT_KINDS[self.kind]
+        how = f", for {self.over_s:.2g} s" if self.over_s else ""
+        if kind.comes:
+            how = f", within {self.over_s:g} s" if self.over_s else ", at once"
+        return kind.text + kind.said.format(kind.times * self.size) + how
 
 
 #: How physical changes come: suffix of the name, and time over which they come, s.
@@ -157,15 +215,12 @@ _RAMPS: Final = (("at_once", 0.0), ("fast", 0.2), ("slow", 10.0))
 #: Classes of events: name → (kind, time over which it comes, s; None: drawn).
 CLASSES: Final[dict[str, tuple[str, float | None]]] = {
     "none": ("none", 0.0),
-    **{f"{kind}_{how}": (kind, over) for kind in ("gain", "zero", "payload", "lag") for how, over in _RAMPS},
     **{
-        kind: (kind, None)
-        for kind in (
-            "knock", "hum", "spikes", "bursts", "gap", "losses", "duplicates", "reversed", "number_jump",
-            "number_stray", "clock", "rail", "stuck", "stuck_noise", "sensor_gain", "sign", "foreign", "units",
-            "exchanged", "u_sign", "u_constant", "u_late", "u_scaled", "other_stage",
-        )
+        f"{name}_{how}": (name, over_s)
+        for name, kind in EVENT_KINDS.items() if kind.comes
+        for how, over_s in _RAMPS
     },
+    **{name: (name, None) for name, kind in EVENT_KINDS.items() if name != "none" and not kind.comes},
 }  # fmt: skip
 #: The classes of a rehearsal by default: one of each sort, some seconds each.
 STANDARD: Final = (
@@ -173,8 +228,6 @@ STANDARD: Final = (
     "bursts", "gap", "losses", "number_jump", "number_stray", "clock", "rail", "stuck", "stuck_noise", "sensor_gain",
     "sign", "foreign",
 )  # fmt: skip
-#: Jumps of the sample count that are drawn; the largest leaves room for numbers after it.
-_JUMPS: Final = (1000.0, 100_000.0, float(2**62 - 2**40))
 
 
 def draw(name: str, seed: int, at_s: float) -> Event:
@@ -186,56 +239,10 @@ def draw(name: str, seed: int, at_s: float) -> Event:
         raise FieldError("events", repr(name), f"some of {', '.join(CLASSES)}")
     kind, over_s = CLASSES[name]
     rng = np.random.default_rng([seed, list(CLASSES).index(name)])
-    sign = float(rng.choice([-1.0, 1.0]))
-    event = Event(name, kind, at_s, 0.0, 0.0 if over_s is None else over_s, int(rng.integers(2**31)))
-
-    def between(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    if kind == "gain":
-        return replace(event, size=sign * rng.uniform(0.03, 0.12))
-    if kind == "zero":
-        return replace(event, size=sign * rng.uniform(0.01, 0.08))
-    if kind == "payload":
-        return replace(event, size=float(rng.uniform(0.3, 2.0)))
-    if kind == "lag":
-        return replace(event, size=between(2e-4, 3e-3))
-    if kind == "knock":
-        return replace(event, size=between(0.01, 0.05))
-    if kind == "hum":
-        return replace(event, size=between(5e-4, 0.01), over_s=float(rng.uniform(1.0, 3.0)))
-    if kind in ("spikes", "bursts"):
-        return replace(event, size=between(0.005, 1.0), over_s=float(rng.uniform(1.0, 3.0)))
-    if kind == "gap":
-        return replace(event, over_s=between(0.01, 3.0))
-    if kind == "losses":
-        return replace(event, size=float(rng.uniform(0.3, 0.95)), over_s=float(rng.uniform(1.0, 4.0)))
-    if kind == "duplicates":
-        return replace(event, size=float(rng.uniform(0.2, 1.0)), over_s=float(rng.uniform(1.0, 3.0)))
-    if kind == "reversed":
-        return replace(event, over_s=float(rng.uniform(0.5, 2.0)))
-    if kind == "number_jump":
-        return replace(event, size=_JUMPS[int(rng.integers(3))])
-    if kind == "number_stray":
-        return replace(event, size=(1000.0, 100_000.0, float(2**62))[int(rng.integers(3))])
-    if kind == "clock":
-        return replace(event, size=sign * between(0.01, 1e6))
-    if kind == "rail":
-        return replace(event, over_s=1.0)
-    if kind == "stuck_noise":
-        return replace(event, size=between(1e-9, 3e-5), over_s=float(rng.uniform(2.0, 5.0)))
-    if kind == "sensor_gain":
-        size = between(0.01, 0.5) if rng.uniform() < 0.5 else float(rng.uniform(1.6, 3.0))
-        return replace(event, size=size, over_s=float(rng.uniform(2.0, 8.0)))
-    if kind == "u_late":
-        return replace(event, size=between(0.005, 0.05), over_s=float(rng.uniform(2.0, 5.0)))
-    if kind == "other_stage":
-        return replace(event, size=between(0.2, 1.5), over_s=float(rng.uniform(2.0, 5.0)))
-    if kind == "u_scaled":
-        return replace(event, size=float(rng.uniform(1.5, 3.0)) ** float(sign), over_s=float(rng.uniform(2.0, 5.0)))
-    if EVENT_KINDS[kind].category == SENSOR:
-        return replace(event, over_s=float(rng.uniform(2.0, 5.0)))
-    return event
+    sign, own_seed = float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
+    drawn = EVENT_KINDS[kind]
+    size = drawn.size(rng, sign)
+    return Event(name, kind, at_s, size, drawn.over_s(rng, sign) if over_s is None else over_s, own_seed)
 
 
 #: Ringing after an emulated knock: ranges of its frequency, Hz, and its damping ratio.

@@ -15,10 +15,10 @@ import numpy as np
 
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.types import FloatArray, InverseModel
-from dehyst.baselines import fit_bouc_wen, fit_linear, fit_mpi
 from dehyst.lab.rehearsal.config import RehearsalConfig
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import LEARN
+from dehyst.service.identification.identifying import identify_one
 from dehyst.service.protocol.errors import FieldError
 from dehyst.sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
 
@@ -273,7 +273,7 @@ def identify(
     models: dict[str, InverseModel] = {LEARN: model}
     for name in config.compete:
         progress(0.8)
-        models[name] = _FITS[name](u_V, y_um, dt_s)
+        models[name] = identify_one(name, u_V, y_um, dt_s, support)
     features = model.features
     slew = config.slew_V_per_s or SLEW_SPANS_PER_S * (plant.u_max_V - plant.u_min_V)
     limits = Limits(plant.u_min_V, plant.u_max_V, slew)
@@ -304,22 +304,3 @@ def go_to_lowest(plant: Plant, low_V: float) -> None:
     q = np.linspace(0.0, 1.0, max(2, round(APPROACH_S / plant.dt_s)))
     run_checked(plant, rest_V + (low_V - rest_V) * q**4 * (35.0 - 84.0 * q + 70.0 * q**2 - 20.0 * q**3))
     run_checked(plant, np.full(max(1, round(REST_S / plant.dt_s)), low_V))
-
-
-def _linear(u_V: FloatArray, y_um: FloatArray, dt_s: float) -> InverseModel:
-    return fit_linear(u_V, y_um, dt_s)[0]
-
-
-def _mpi(u_V: FloatArray, y_um: FloatArray, dt_s: float) -> InverseModel:
-    return fit_mpi(u_V, y_um, dt_s)[0]
-
-
-def _bouc_wen(u_V: FloatArray, y_um: FloatArray, dt_s: float) -> InverseModel:
-    return fit_bouc_wen(u_V, y_um, dt_s)[0]
-
-
-_FITS: Final[dict[str, Callable[[FloatArray, FloatArray, float], InverseModel]]] = {
-    "linear": _linear,
-    "mpi": _mpi,
-    "bouc_wen": _bouc_wen,
-}

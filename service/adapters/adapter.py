@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 from dehyst.adaptive.errors import DehystError
 from dehyst.service.protocol.errors import FieldError
@@ -72,6 +72,20 @@ class StatesAxis(Protocol):
     def stated(self) -> Stated:
         """What the controller says now. Raises AdapterError where it does not answer."""
         ...
+
+
+class Closing:
+    """What closes itself at the end of its ``with``."""
+
+    def close(self) -> None:
+        """Release the controller. The voltage stays as it is."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def load_library(module: str, package: str) -> ModuleType:

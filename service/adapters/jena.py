@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Coroutine
-from types import TracebackType
 from typing import Any
 
-from dehyst.service.adapters.adapter import AdapterError, check_rate, load_library
+from dehyst.service.adapters.adapter import AdapterError, Closing, check_rate, load_library
 
 
-class Nv200Stage:
+class Nv200Stage(Closing):
     """An NV200 in open loop; a `service.adapters.StageAdapter` and a context manager.
 
     The library waits 10 ms before each command, to empty its input, and each sample takes two: it bounds the rate to
@@ -84,11 +83,3 @@ class Nv200Stage:
 
     def _do(self, work: Coroutine[Any, Any, Any]) -> Any:
         return self._loop.run_until_complete(work)
-
-    def __enter__(self) -> Nv200Stage:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

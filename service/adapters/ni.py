@@ -8,14 +8,13 @@ Sources: documentation of nidaqmx-python 1.x.
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Any
 
-from dehyst.service.adapters.adapter import AdapterError, check_rate, load_library
+from dehyst.service.adapters.adapter import AdapterError, Closing, check_rate, load_library
 from dehyst.service.protocol.errors import FieldError
 
 
-class NiStage:
+class NiStage(Closing):
     """An analogue output that drives a piezo amplifier, and an analogue input that reads a sensor.
 
     A `service.adapters.StageAdapter` and a context manager. Reading and writing are software-timed, one sample each: a
@@ -76,11 +75,3 @@ class NiStage:
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.close()
-
-    def __enter__(self) -> NiStage:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

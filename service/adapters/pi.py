@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
-from dehyst.service.adapters.adapter import AdapterError, Stated, check_rate, load_library
+from dehyst.service.adapters.adapter import AdapterError, Closing, Stated, check_rate, load_library
 
 _PORT = 50_000
 
 
-class PiStage:
+class PiStage(Closing):
     """One axis of a PI controller in open loop; a `service.adapters.StageAdapter` and a context manager.
 
     The servo of the axis is switched off: the voltage is set by ``SVA``, whose unit is the volt for piezo axes. Each
@@ -107,11 +106,3 @@ class PiStage:
         """Close the connection; the voltage stays."""
         # As at the end of its `with`: closing alone leaves the device registered with the next connection.
         self._device.__exit__(None, None, None)
-
-    def __enter__(self) -> PiStage:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

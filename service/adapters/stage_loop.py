@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import zenoh
 from numpy.typing import NDArray
 
 from dehyst.adaptive.types import FloatArray
@@ -17,14 +16,12 @@ from dehyst.service.adapters.adapter import AdapterError, StageAdapter, Ticks, a
 from dehyst.service.answers.guard import limit_voltage
 from dehyst.service.client.client import Client
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.stage_node.exchange import RING_SIZE, CommandBuffer, Sender, next_message
+from dehyst.service.stage_node.exchange import CommandBuffer, SampleRing, Sender
 
 #: (sample number, reading at that instant, µm) -> voltage from that instant on, V.
 Control = Callable[[int, float], float]
 #: Relative difference of two sample times from which they count as different.
 _SAME_RATE: Final = 1e-6
-#: Samples that are kept, for a slow network and for resynchronising: half a minute at 1 kHz.
-KEPT: Final = RING_SIZE
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,54 +46,6 @@ class LoopSummary:
     lost: int
     missing: int
     foreign: int
-
-
-class SampleLog:
-    """The last `KEPT` samples, written by the loop, sent by another thread.
-
-    Samples that waited for longer than that are lost and counted.
-    """
-
-    def __init__(self, client: Client) -> None:
-        self.written = self.published = self.lost = 0
-        self._client = client
-        self._seq = np.zeros(KEPT, dtype=np.int64)
-        self._t_s, self._u_V, self._y_um = np.zeros(KEPT), np.zeros(KEPT), np.zeros(KEPT)
-        self._sent = 0
-
-    def write(self, seq: int, t_s: float, u_V: float, y_um: float) -> None:
-        """Write a sample; numbers rise, with gaps where the loop was late."""
-        slot = self.written % KEPT
-        self._seq[slot], self._t_s[slot], self._u_V[slot], self._y_um[slot] = seq, t_s, u_V, y_um
-        self.written += 1
-
-    def since(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-        """(numbers, V, µm), (n,) each, of the samples from number ``seq`` on, as far as kept. For the loop's thread."""
-        first = self.written
-        while first > max(self.written - KEPT, 0) and self._seq[(first - 1) % KEPT] >= seq:
-            first -= 1
-        slots = np.arange(first, self.written) % KEPT
-        return self._seq[slots], self._u_V[slots], self._y_um[slots]
-
-    def send(self) -> bool:
-        """Send what waits, at most `MAX_MESSAGE` samples in one message. Returns whether more is left."""
-        end = self.written
-        self._sent, n, lost = next_message(self._sent, end, KEPT)
-        self.lost += lost
-        if n <= 0:
-            return False
-        slots = np.arange(self._sent, self._sent + n) % KEPT
-        self._sent += n
-        try:
-            self._client.samples(self._seq[slots], self._t_s[slots], self._u_V[slots], self._y_um[slots])
-        except zenoh.ZError:
-            self.lost += n
-        else:
-            self.published += n
-        return self._sent < end
-
-    def finish(self) -> None:
-        """Nothing is held back."""
 
 
 class StageLoop:
@@ -136,7 +85,7 @@ class StageLoop:
         self._next = self.first
         self._stop = False
         self._limited = 0
-        self._log = SampleLog(client)
+        self._log = SampleRing(client.samples)
         self._commands = CommandBuffer(begin=self.first)
 
     def stop(self) -> None:
@@ -146,7 +95,7 @@ class StageLoop:
     def measured(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
         """(numbers, voltages V, readings µm), (n,) each, of the last samples from number ``seq`` on.
 
-        The last `KEPT` samples are kept. For ``Follower.resynchronise``, and for a controller that closes a loop.
+        Half a minute of them is kept at 1 kHz. For ``Follower.resynchronise``, and for a controller that closes a loop.
         """
         return self._log.since(seq)
 

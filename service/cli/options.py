@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -96,13 +95,18 @@ def add_epilog(parser: argparse.ArgumentParser, text: str, files: bool = False) 
     parser.epilog = text + ("\n" + EXAMPLE_FILES if files else "")
 
 
-def progress_printer(quiet: bool) -> Callable[[str], None]:
-    """Prints a line of progress to stderr at once, so that stdout holds the result only; nothing if ``quiet``."""
-    return (lambda _: None) if quiet else functools.partial(_print_progress)
+def progress_printer(quiet: bool, first: Callable[[], None] = lambda: None) -> Callable[[str], None]:
+    """Prints a line of progress to stderr at once, so that stdout holds the result only; nothing if ``quiet``.
 
+    ``first`` is called before each line; it may raise where a signal has come.
+    """
 
-def _print_progress(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    def say(line: str) -> None:
+        first()
+        if not quiet:
+            print(line, file=sys.stderr, flush=True)
+
+    return say
 
 
 def check_seed(seed: int) -> int:

@@ -95,16 +95,13 @@ def pending_before(after: Point | Trajectory | None, begin: int) -> Pending | No
     return Pending(begin - kept, y_um[-kept:], u_V[-kept:])
 
 
-def extended(before: Pending | None, begin: int, y_um: FloatArray, u_V: FloatArray) -> Pending:
-    """``before`` and the (n,) samples from ``begin`` on."""
-    if before is None:
-        return Pending(begin, y_um, u_V)
-    return Pending(before.first, np.concatenate([before.y_um, y_um]), np.concatenate([before.u_V, u_V]))
-
-
 def with_pending(answer: Trajectory, before: Pending | None, begin: int, y_um: FloatArray) -> Trajectory:
     """``answer`` to (n,) ``y_um``, commanded from sample ``begin`` on, behind what is under way ``before`` it."""
-    return answer._replace(pending=extended(before, begin, y_um, answer.u_V))
+    under = Pending(begin, y_um, answer.u_V)
+    if before is not None:
+        columns = (np.concatenate([one, more]) for one, more in zip(before[1:], under[1:], strict=True))
+        under = Pending(before.first, *columns)
+    return answer._replace(pending=under)
 
 
 @dataclass(slots=True)

@@ -62,6 +62,8 @@ class Correcting:
         if repetition is not None and repetition.on:
             self.repetition = Repetition(dt_s, repetition.mode_Hz, repetition.fade_s)
             self._most_repeated_V = repetition.share * drive_V
+        made = {"correction": self.correction, "repetition": self.repetition}
+        self._each = {name: each for name, each in made.items() if each is not None}
         self.age = 0
         self._dt_s, self._slope_every = dt_s, math.ceil(_SLOPE_S / dt_s)
         self._wanted_um = np.full(_KEPT, math.nan)
@@ -118,10 +120,9 @@ class Correcting:
         u_V, std_V = answer
         if self.trouble or not self.on:
             self._readings.clear()
-            for each in (self.correction, self.repetition):
-                if each is not None:
-                    each.release()
-            return np.full(n, self._integral_V + (0.0 if self.repetition is None else self.repetition.u_V))
+            for each in self._each.values():
+                each.release()
+            return np.full(n, sum(each.u_V for each in self._each.values()))
         if self._readings:
             self._look_at_age(first + n - 1 - self._readings[0][0])
             if self._slope_held == 0:
@@ -142,7 +143,7 @@ class Correcting:
             correction.set(self.age, *self._local, self._bound_V(std_V))
         if repetition is not None:
             repetition.set(self.age, *self._local, self._most_repeated_V)
-        halved = self._halved
+        halved = {name: each.halved for name, each in self._each.items()}
         for seq, read_um in self._readings:
             wanted_um = self._asked(seq)
             if repetition is not None:
@@ -150,8 +151,8 @@ class Correcting:
             if correction is not None and not (repetition is not None and repetition.active):
                 correction.take(wanted_um - read_um, (wanted_um - self._asked(seq - 1)) / self._dt_s)
         self._readings.clear()
-        for name, before, each in zip(("correction", "repetition"), halved, (correction, repetition), strict=True):
-            if each is not None and each.halved > before:
+        for name, each in self._each.items():
+            if each.halved > halved[name]:
                 _LOGGER.warning(
                     "the %s grew up to sample %d: its gain is now %g of the design; is %s.mode_Hz above the stage's "
                     "first mode?", name, last, each.factor, name,
@@ -166,11 +167,6 @@ class Correcting:
     @property
     def _integral_V(self) -> float:
         return 0.0 if self.correction is None else self.correction.u_V
-
-    @property
-    def _halved(self) -> tuple[int, int]:
-        correction, repetition = self.correction, self.repetition
-        return 0 if correction is None else correction.halved, 0 if repetition is None else repetition.halved
 
     def begin(self, u_V: float, std_V: float) -> None:
         """Begin with the correction ``u_V``, V, as far as it is within its bound: a stage that is driven already."""

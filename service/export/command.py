@@ -12,7 +12,7 @@ from dehyst.service.protocol.keys import ROOT, Keys
 
 if TYPE_CHECKING:
     from dehyst.service.answers.guard import Limits
-    from dehyst.service.export import Frozen
+    from dehyst.service.export.exporting import Frozen
 
 EPILOG = """\
 The exported model is frozen: it learns no further, and no stand-in takes its place outside the learnt range (flag 4).
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export. Returns 0. Raises InputError and ServiceError with what is wrong."""
-    from dehyst.service.export import compiler, write_export
+    from dehyst.service.export.exporting import compiler, write_export
     from dehyst.service.storage.output import clear_output
 
     if (args.data is None) == (args.from_service is None):
@@ -69,7 +69,7 @@ def _motion(text: str | None) -> tuple[float, float] | None:
 
 
 def _from_file(args: argparse.Namespace) -> Frozen:
-    from dehyst.service.export import Frozen
+    from dehyst.service.export.exporting import Frozen
     from dehyst.service.storage.model_file import read_bundle
 
     bundle = read_bundle(args.data)
@@ -84,7 +84,7 @@ def _from_file(args: argparse.Namespace) -> Frozen:
 
 def _from_service(args: argparse.Namespace) -> Frozen:
     from dehyst.service.client.client import Client
-    from dehyst.service.export import Frozen
+    from dehyst.service.export.exporting import Frozen
 
     parts = args.from_service.removeprefix(f"{ROOT}/").split("/")
     if len(parts) != 2:

@@ -17,7 +17,8 @@ from dehyst.adaptive.types import FloatArray
 from dehyst.service.reports.diagnosis_page import spaced
 from dehyst.service.reports.plot_style import envelope
 from dehyst.service.viewer.colours import AFTER, BEFORE, rgb
-from dehyst.service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
+from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane, grown
+from dehyst.service.viewer.rerun_sink import desk, over_time, plane_view
 from dehyst.service.viewer.style import FRAME, LABEL, WHITE, Colour
 from dehyst.sim.diagnosis.result import Diagnosis, picture
 from dehyst.sim.pictures import MEASURED, WITH, WITHOUT, Curve, Picture
@@ -55,7 +56,7 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
     ]
     pictures = {f"cause/{i + 1}_{c.name}": picture(c, data, d.catalogue) for i, c in enumerate(d.causes)}
     tabs = [
-        _plane_view(f"{i + 1}. {spaced(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
+        plane_view(f"{i + 1}. {spaced(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
     ]
     stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
     path.unlink(missing_ok=True)
@@ -100,7 +101,7 @@ def _loop(d: Diagnosis) -> Picture:
 
 
 def _draw(stream: rr.RecordingStream, origin: str, shown: Picture) -> None:
-    """Draw curves in a plane with axes (`service.viewer.layout`). A logarithmic axis shows log10."""
+    """Draw curves in a plane with axes (`service.viewer.plane`). A logarithmic axis shows log10."""
     x_name = f"log10 of {shown.x_name}" if shown.log_x else shown.x_name
     y_name = f"log10 of {shown.y_name}" if shown.log_y else shown.y_name
     curves = [(c, _scaled(c.x, shown.log_x), _scaled(c.y, shown.log_y)) for c in shown.curves]
@@ -140,42 +141,21 @@ def _limits(arrays: Iterable[FloatArray]) -> tuple[float, float]:
     return limits or (0.0, 1.0)
 
 
-def _plane_view(name: str, origin: str) -> rrb.Spatial2DView:
-    (left, right), (top, bottom) = BOUNDS
-    return rrb.Spatial2DView(
-        name=name,
-        origin=f"/{origin}",
-        background=[16, 16, 18],
-        visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
-    )
-
-
 def _desk(causes: list[rrb.Spatial2DView], unit: str) -> rrb.Blueprint:
     """Layout: curves over time on the left, causes and loop in the middle, the report on the right."""
     whole = rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
 
-    def over_time(name: str, *paths: str) -> rrb.TimeSeriesView:
-        return rrb.TimeSeriesView(
-            name=name,
-            origin="/",
-            contents=[f"+ /{p}" for p in paths],
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-            time_ranges=whole,
-        )
+    def curves(name: str, *paths: str) -> rrb.TimeSeriesView:
+        return over_time(name, paths, whole, rrb.Corner2D.RightTop)
 
     left = rrb.Vertical(
-        over_time("Voltage, V", "voltage_V"),
-        over_time("Reading, µm", "reading/measured_um", "reading/nominal_um", "reading/extended_um"),
-        over_time(f"Residual of the nominal stage, {unit}", "residual/nominal"),
-        over_time(f"Residual of the extended stage, {unit}", "residual/extended"),
+        curves("Voltage, V", "voltage_V"),
+        curves("Reading, µm", "reading/measured_um", "reading/nominal_um", "reading/extended_um"),
+        curves(f"Residual of the nominal stage, {unit}", "residual/nominal"),
+        curves(f"Residual of the extended stage, {unit}", "residual/extended"),
     )
-    loop = _plane_view("Loop: reading over voltage", "loop")
+    loop = plane_view("Loop: reading over voltage", "loop")
     middle = rrb.Vertical(rrb.Tabs(*causes, active_tab=0), loop) if causes else loop
     page = rrb.TextDocumentView(name="Report", origin="/report")
-    return rrb.Blueprint(
-        rrb.Horizontal(left, middle, page, column_shares=(4.0, 4.0, 3.0)),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-        auto_views=False,
-    )
+    views = rrb.Horizontal(left, middle, page, column_shares=(4.0, 4.0, 3.0))
+    return desk(views, rrb.TimePanel(state="collapsed", timeline=TIMELINE))

@@ -5,12 +5,10 @@ A simulated stage (`service.stage_node.node`) and a real one (`service.adapters`
 
 from __future__ import annotations
 
-import contextlib
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import zenoh
@@ -20,7 +18,6 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.stage_node.faults import Injector
 
 # --- The commands of a stage node: voltages by sequence number. Late and missing ones are counted.
 
@@ -121,96 +118,65 @@ RING_SIZE: Final = 32_768
 MAX_MESSAGE: Final = 4096
 
 
-def next_message(sent: int, written: int, size: int) -> tuple[int, int, int]:
-    """(first, n, lost) of the next message from a ring of ``size`` slots: its first sample, its length, and how many
-    samples before it were overwritten. The slots that the loop writes next are left alone."""
-    lost = max(0, written - size + MAX_MESSAGE - sent)
-    return sent + lost, min(written - sent - lost, MAX_MESSAGE), lost
-
-
 class SampleRing:
-    """Samples by number, written by one thread and sent by another.
+    """The last `RING_SIZE` samples, written by the loop and sent by another thread.
 
-    ``injector`` may change the messages. Samples that it leaves out count neither as published nor as lost; samples
-    that it sends twice count twice as published. ``put_sound`` sends the samples without its faults.
+    ``put`` sends one message: (n,) numbers, times, s, voltages, V, and readings, µm. Samples that wait for longer than
+    the ring lasts, or that it cannot send, are lost and counted.
     """
 
-    def __init__(
-        self,
-        dt_s: float,
-        put: Callable[[bytes], None],
-        injector: Injector | None = None,
-        begin: int = 0,
-        put_sound: Callable[[bytes], None] | None = None,
-    ) -> None:
-        self.dt_s = dt_s
-        self.published = 0
-        self.lost = 0
-        self._injector = injector
+    def __init__(self, put: Callable[[NDArray[np.int64], FloatArray, FloatArray, FloatArray], None]) -> None:
+        self.written = self.published = self.lost = 0
         self._put = put
-        self._u_V: FloatArray = np.zeros(RING_SIZE)
-        self._y_um: FloatArray = np.zeros(RING_SIZE)
-        self._put_sound = put_sound
-        self._sound_um: FloatArray = np.zeros(RING_SIZE if put_sound is not None else 0)
-        self._written = begin
-        self._sent = begin
+        self._seq = np.zeros(RING_SIZE, dtype=np.int64)
+        self._t_s, self._u_V, self._y_um = np.zeros(RING_SIZE), np.zeros(RING_SIZE), np.zeros(RING_SIZE)
+        self._sent = 0
 
-    def write(self, k: int, u_V: float, y_um: float, sound_um: float = math.nan) -> None:
-        """Write sample k; samples come in order, without gaps, from ``begin`` on. ``sound_um``: without a fault."""
-        slot = k % RING_SIZE
-        self._u_V[slot] = u_V
-        self._y_um[slot] = y_um
-        if self._put_sound is not None:
-            self._sound_um[slot] = sound_um
-        self._written = k + 1
+    def write(self, seq: int, t_s: float, u_V: float, y_um: float) -> None:
+        """Write a sample; numbers rise."""
+        slot = self.written % RING_SIZE
+        self._seq[slot], self._t_s[slot], self._u_V[slot], self._y_um[slot] = seq, t_s, u_V, y_um
+        self.written += 1
+
+    def since(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+        """(numbers, V, µm), (n,) each, of the samples from number ``seq`` on, as far as kept. For the loop's thread."""
+        first = self.written
+        while first > max(self.written - RING_SIZE, 0) and self._seq[(first - 1) % RING_SIZE] >= seq:
+            first -= 1
+        slots = np.arange(first, self.written) % RING_SIZE
+        return self._seq[slots], self._u_V[slots], self._y_um[slots]
 
     def send(self) -> bool:
-        """Send what waits, at most ``MAX_MESSAGE`` samples in one message. Returns whether more is left."""
-        end = self._written
-        self._sent, n, lost = next_message(self._sent, end, RING_SIZE)
+        """Send what waits, at most `MAX_MESSAGE` samples in one message. Returns whether more is left."""
+        end = self.written
+        # The slots that the loop writes next are left alone.
+        lost = max(0, end - RING_SIZE + MAX_MESSAGE - self._sent)
+        first = self._sent + lost
         self.lost += lost
-        if n <= 0:
+        self._sent = min(end, first + MAX_MESSAGE)
+        if self._sent == first:
             return False
-        seq = np.arange(self._sent, self._sent + n, dtype=np.int64)
-        slots = seq % RING_SIZE
-        rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
-        self._sent += n
-        if self._put_sound is not None:
-            # Losses are not counted: this signal is for tests only.
-            with contextlib.suppress(zenoh.ZError):
-                self._put_sound(wire.encode_samples(*rows[:3], self._sound_um[slots]))
-        for message in [rows] if self._injector is None else self._injector.deliver(rows):
-            self._send(*message)
+        slots = np.arange(first, self._sent) % RING_SIZE
+        self.deliver(self._seq[slots], self._t_s[slots], self._u_V[slots], self._y_um[slots])
         return self._sent < end
 
-    def finish(self) -> None:
-        """Send what a fault holds back."""
-        for message in [] if self._injector is None else self._injector.flush():
-            self._send(*message)
-
-    def _send(self, seq: NDArray[np.int64], t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
+    def deliver(self, seq: NDArray[np.int64], t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
+        """Send one message."""
         try:
-            self._put(wire.encode_samples(seq, t_s, u_V, y_um))
+            self._put(seq, t_s, u_V, y_um)
         except zenoh.ZError:
             self.lost += len(seq)
         else:
             self.published += len(seq)
 
-
-class Outbox(Protocol):
-    """Samples that wait to be sent: ``send`` sends one message of them and returns whether more is left."""
-
-    def send(self) -> bool: ...
-
     def finish(self) -> None:
         """Called once, after the last ``send``."""
-        ...
 
 
 class Sender:
     """The thread ``stage-sender``: it empties the rings and calls ``status`` when the loop asks for it."""
 
-    def __init__(self, rings: Sequence[Outbox], status: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, rings: Sequence[SampleRing], status: Callable[[], None] = lambda: None) -> None:
         self._rings = rings
         self._status = status
         self._wake = threading.Event()

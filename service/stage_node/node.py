@@ -107,6 +107,27 @@ class NodeConfig:
             raise FieldError("ticks", self.ticks, "at least 1")
 
 
+class FaultyRing(SampleRing):
+    """A ring whose messages an injector may change.
+
+    Samples that it leaves out count neither as published nor as lost; samples that it sends twice count twice.
+    """
+
+    def __init__(self, put: Callable[..., None], injector: Injector) -> None:
+        super().__init__(put)
+        self._injector = injector
+
+    def deliver(self, *rows: Any) -> None:
+        """Send what the faults make of one message."""
+        for message in self._injector.deliver(rows):
+            super().deliver(*message)
+
+    def finish(self) -> None:
+        """Send what a fault holds back."""
+        for message in self._injector.flush():
+            super().deliver(*message)
+
+
 class AxisPort:
     """One axis in the network: its commands, samples, publishers and faults."""
 
@@ -122,28 +143,26 @@ class AxisPort:
         self._u_V = 0.0
         self.commands = CommandBuffer(begin=config.first)
         self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
+        self._dt_s = config.stage.dt_s
         # Samples must not be lost: a full channel blocks the sender thread, not the loop, and drops nothing.
         publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
-        self._publisher, by = publisher, own_authenticator()
+        by = own_authenticator()
 
-        def put(payload: bytes) -> None:
+        def put(*rows: Any) -> None:
+            payload = wire.encode_samples(*rows)
             publisher.put(payload, attachment=by.published(keys.sample, payload))
 
-        sound = None
-        if self.injector is not None:
-            sound = session.declare_publisher(sound_key(config.name, axis), express=True)
-        self._sound = sound
-        put_sound = None if sound is None else sound.put
-        self.ring = SampleRing(config.stage.dt_s, put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
         self.gate = CommandGate(session, keys, by, self.commands.receive)
-        self._subscribers: list[Any] = [self.gate]
+        self._declared: list[Any] = [self.gate, publisher, self.status]
+        self.ring = SampleRing(put) if self.injector is None else FaultyRing(put, self.injector)
+        self.rings = [self.ring]
         if self.injector is not None:
-            self._subscribers.append(session.declare_subscriber(fault_key(config.name, axis), self._take_fault))
-
-    def _take_fault(self, sample: zenoh.Sample) -> None:
-        assert self.injector is not None
-        self.injector.receive(sample.payload.to_bytes())
+            receive = self.injector.receive
+            sound = session.declare_publisher(sound_key(config.name, axis), express=True)
+            self.rings.append(SampleRing(lambda *rows: sound.put(wire.encode_samples(*rows))))
+            faults = session.declare_subscriber(fault_key(config.name, axis), lambda s: receive(s.payload.to_bytes()))
+            self._declared += [faults, sound]
 
     def take(self, k: int) -> float:
         """The voltage for tick k, V, within range and slew limit."""
@@ -153,10 +172,10 @@ class AxisPort:
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""
-        if self.injector is None:
-            self.ring.write(k, u_V, y_um)
-        else:
-            self.ring.write(k, u_V, self.injector.reading(k, y_um), y_um)
+        t_s = k * self._dt_s
+        self.ring.write(k, t_s, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+        for sound in self.rings[1:]:
+            sound.write(k, t_s, u_V, y_um)
 
     def summary(self) -> dict[str, Any]:
         summary: dict[str, Any] = {
@@ -172,12 +191,8 @@ class AxisPort:
         return summary
 
     def close(self) -> None:
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
-        if self._sound is not None:
-            self._sound.undeclare()  # type: ignore[no-untyped-call]
-        self.status.undeclare()  # type: ignore[no-untyped-call]
+        for declared in self._declared:
+            declared.undeclare()
 
 
 # --- The node
@@ -220,7 +235,7 @@ class StageNode:
             for axis in config.units
         ]
         self._ports = [port for unit in self._units for port in unit.ports]
-        self._sender = Sender([port.ring for port in self._ports], self._publish_status)
+        self._sender = Sender([ring for port in self._ports for ring in port.rings], self._publish_status)
         self._counts: dict[str, Any] = {
             "state": "waiting", "first": config.first, "tick": config.first, "late": 0, "worst_late_ms": 0.0,
             "waited_s": 0.0,

@@ -13,14 +13,8 @@ from typing import TYPE_CHECKING
 from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from dehyst.service.viewer.consumer import Consumer as Consumer
-    from dehyst.service.viewer.consumer import ConsumerConfig as ConsumerConfig
-    from dehyst.service.viewer.output import Output as Output
-    from dehyst.service.viewer.output import OutputConfig as OutputConfig
     from dehyst.service.viewer.records import Diagnostics as Diagnostics
     from dehyst.service.viewer.records import Event as Event
-    from dehyst.service.viewer.records import Health as Health
-    from dehyst.service.viewer.records import Record as Record
     from dehyst.service.viewer.records import SceneConfig as SceneConfig
     from dehyst.service.viewer.records import Status as Status
     from dehyst.service.viewer.records import Tracking as Tracking

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,14 +41,10 @@ class Tracking:
 
     def __post_init__(self) -> None:
         n = len(self.seq)
-        columns = {
-            "t_s": self.t_s, "u_V": self.u_V, "y_um": self.y_um, "reference_um": self.reference_um, "std_V": self.std_V,
-        }  # fmt: skip
-        for name, value in columns.items():
-            if value is not None and np.shape(value) != (n,):
-                raise InputError(
-                    f"{name}: got shape {np.shape(value)}, expected ({n},), one value for each sequence number"
-                )
+        for name in ("t_s", "u_V", "y_um", "reference_um", "std_V"):
+            shape = np.shape(getattr(self, name))
+            if shape != (n,) and getattr(self, name) is not None:
+                raise InputError(f"{name}: got shape {shape}, expected ({n},), one value for each sequence number")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,22 +97,17 @@ class SceneConfig:
     title : name of the recording, for example ``demo/x``.
     models : the models whose units are shown; the first is the one that the service serves and that learns.
     range_um : motion range that percentages refer to, µm; None: the span of the reference so far.
-    u_limits_V, y_limits_um : limits of the (u, y) plane; None: they grow with the data.
     loop_s : length of the past that one loop shows, s.
     mae_s : time over which the absolute error is averaged, s.
     history_s : length of the past that the plots show, s; None: all of it.
-    notes : texts that the recording carries, by name.
     """
 
     title: str
     models: tuple[str, ...] = ("lssvm_adaptive",)
     range_um: float | None = None
-    u_limits_V: tuple[float, float] | None = None
-    y_limits_um: tuple[float, float] | None = None
     loop_s: float = 2.0
     mae_s: float = 0.5
     history_s: float | None = None
-    notes: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.models or len(set(self.models)) != len(self.models):
@@ -125,9 +116,6 @@ class SceneConfig:
         for name, length in lengths.items():
             if length is not None and not (np.isfinite(length) and length > 0):
                 raise InputError(f"{name}: got {length!r}, expected a positive number")
-        for name, limits in (("u_limits_V", self.u_limits_V), ("y_limits_um", self.y_limits_um)):
-            if limits is not None and not (np.all(np.isfinite(limits)) and limits[0] < limits[1]):
-                raise InputError(f"{name}: got {limits!r}, expected (low, high) with low < high")
 
 
 # --- Events of the protocol
@@ -135,36 +123,16 @@ class SceneConfig:
 
 #: Events that mark a change of the stage.
 CHANGES = frozenset({"change", "stage_change", "stage_changed"})
-_LEVELS = {"ERROR": "ERROR", "WARN": "WARN", "WARNING": "WARN", "INFO": "INFO", "DEBUG": "DEBUG"}
 _FAILING = ("error", "fail")
 _ALARMING = (
-    "change",
-    "drift",
-    "drop",
-    "full",
-    "gap",
-    "late",
-    "lost",
-    "malformed",
-    "refus",
-    "restart",
-    "rolled",
-    "stall",
-)
+    "change", "drift", "drop", "full", "gap", "late", "lost", "malformed", "refus", "restart", "rolled", "stall",
+)  # fmt: skip
 
 
 def event_record(t_s: float, seq: int, fields: Mapping[str, Any]) -> Event:
-    """An event of the protocol as a line of text: its ``event`` and ``detail``, or all fields if these are missing."""
-    kind = str(fields.get("event", fields.get("kind", "")))
-    detail = fields.get("detail", fields.get("message", fields.get("text")))
-    if detail is None:
-        detail = ", ".join(f"{k} {v}" for k, v in fields.items() if k not in ("event", "kind", "seq", "t_s", "level"))
-    level = _LEVELS.get(str(fields.get("level", "")).upper())
-    if level is None:
-        level = "INFO"
-        if any(word in kind.lower() for word in _ALARMING):
-            level = "WARN"
-        if any(word in kind.lower() for word in _FAILING):
-            level = "ERROR"
-    text = f"{kind}: {detail}" if kind and detail else kind or str(detail)
-    return Event(t_s, seq, text, level, change=kind in CHANGES)
+    """An event of the protocol as a line of text: its ``event`` and ``detail``. Its level follows from its name."""
+    kind, detail = str(fields.get("event", "")), str(fields.get("detail", ""))
+    level = "WARN" if any(word in kind for word in _ALARMING) else "INFO"
+    if any(word in kind for word in _FAILING):
+        level = "ERROR"
+    return Event(t_s, seq, ": ".join(filter(None, (kind, detail))), level, change=kind in CHANGES)

@@ -1,4 +1,4 @@
-"""The only module that knows Rerun: a canvas that draws live into a viewer, or a whole run into an ``.rrd`` file."""
+"""A canvas that draws by Rerun, into a viewer or a whole run into an ``.rrd`` file, and the views of its curves."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -17,12 +19,10 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.viewer import style
-from dehyst.service.viewer.layout import Box, Part, PlaneView, Plot, layout
+from dehyst.service.viewer.plane import BOUNDS
 from dehyst.service.viewer.records import Event, IntArray, Record, SceneConfig, Tracking
 from dehyst.service.viewer.scene import Scene
 
-# --- The only module that knows Rerun: a canvas that draws into a viewer or an ``.rrd`` file.
-#
 # Drawing may block: a stream to a viewer that has gone blocks the caller once its buffers are full. Use it behind
 # `service.viewer.output` where nothing may wait.
 
@@ -34,11 +34,9 @@ VIEWER_MEMORY, SERVER_MEMORY = "1GiB", "64MiB"
 
 
 class RerunSink:
-    """Draws into the file ``rrd`` or the viewer at ``connect``. Close it, or the end of the run may be missing.
+    """Draws into the file ``rrd``, or without one into the viewer at ``connect``.
 
-    Raises
-    ------
-    InputError : both or neither of ``rrd`` and ``connect`` given, or the file cannot be written.
+    Close it, or the end of the run may be missing. Raises InputError if the file cannot be written.
     """
 
     def __init__(
@@ -49,8 +47,6 @@ class RerunSink:
         connect: str | None = None,
         recording_id: str | None = None,
     ) -> None:
-        if (rrd is None) == (connect is None):
-            raise InputError(f"rrd, connect: got {rrd!r} and {connect!r}, expected exactly one of them")
         views = blueprint(config)
         # The live stream and the file of one run have the same id, so that the viewer shows them as one.
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id or str(uuid.uuid4()))
@@ -72,8 +68,6 @@ class RerunSink:
                 rr.SeriesLines(names=line.name, colors=[line.colour], widths=[line.width]),
                 static=True,
             )
-        for name, text in config.notes.items():
-            self._stream.send_property(name, rr.AnyValues(text=text))
 
     def scalars(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None:
         indexes = [rr.TimeColumn(TIMELINE, duration=t_s), rr.TimeColumn(SEQUENCE, sequence=seq)]
@@ -124,55 +118,97 @@ class RerunSink:
         self._stream.set_time(SEQUENCE, sequence=seq)
 
 
+def over_time(
+    name: str, paths: Iterable[str], times: rrb.VisibleTimeRange, corner: rrb.Corner2D = rrb.Corner2D.LeftTop
+) -> rrb.TimeSeriesView:
+    """A view of curves over time; its name states their unit."""
+    contents = [f"+ /{path}" for path in paths]
+    legend = rrb.PlotLegend(corner)
+    return rrb.TimeSeriesView(name=name, origin="/", contents=contents, plot_legend=legend, time_ranges=times)
+
+
+def plane_view(name: str, origin: str) -> rrb.Spatial2DView:
+    """A view of a plane with axes (`service.viewer.plane`)."""
+    x_range, y_range = map(list, BOUNDS)
+    bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=[16, 16, 18], visual_bounds=bounds)
+
+
+def desk(views: rrb.Container, panel: rrb.TimePanel) -> rrb.Blueprint:
+    """A blueprint of these views alone, with the time panel."""
+    return rrb.Blueprint(
+        views,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        panel,
+        auto_views=False,
+    )
+
+
 def blueprint(config: SceneConfig) -> rrb.Blueprint:
-    """The layout of `service.viewer.layout` as a Rerun blueprint."""
+    """The views: tracking on the left, hysteresis in the middle, health of service and stream on the right."""
     start = (
         rrb.TimeRangeBoundary.infinite()
         if config.history_s is None
         else rrb.TimeRangeBoundary.cursor_relative(seconds=-config.history_s)
     )
-    ranges = rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0))
-    return rrb.Blueprint(
-        _part(layout(config), ranges),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        auto_views=False,
+    times = rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0))
+    # The curve that is drawn last lies on top.
+    main, models = config.models[0], config.models[::-1]
+
+    def plot(name: str, *paths: str) -> rrb.TimeSeriesView:
+        return over_time(name, paths, times)
+
+    def tabs(*views: rrb.View) -> rrb.Tabs:
+        return rrb.Tabs(*views, active_tab=0)
+
+    tracking = rrb.Vertical(
+        plot("Displacement: wanted and reached, µm", style.REFERENCE, style.displacement(main)),
+        tabs(
+            plot("Tracking error, µm", *map(style.error, models)),
+            plot(f"{style.name(main)} alone", style.error(main)),
+        ),
+        tabs(
+            plot(
+                f"Mean |error| over {config.mae_s:g} s, log10 of % of range (0 is 1 %, -1 is 0.1 %)",
+                *map(style.mean_error_log, models),
+            ),
+            plot("Linear, % of range", *map(style.mean_error, models)),
+        ),
+        tabs(
+            plot("Voltage and ±2σ, V", style.voltage(main), style.BAND_HIGH, style.BAND_LOW),
+            plot("σ of the voltage, mV", style.SIGMA),
+            plot("Voltages of all models, V", *map(style.voltage, models)),
+        ),
+        row_shares=(1.0, 1.2, 1.2, 0.9),
     )
-
-
-def _part(part: Part, ranges: rrb.VisibleTimeRange) -> rrb.Container | rrb.View:
-    if isinstance(part, Box):
-        inner = [_part(p, ranges) for p in part.parts]
-        if part.kind == "row":
-            return rrb.Horizontal(*inner, column_shares=part.shares)
-        if part.kind == "column":
-            return rrb.Vertical(*inner, row_shares=part.shares)
-        return rrb.Tabs(*inner, active_tab=0)
-    if isinstance(part, Plot):
-        axis = None if part.range is None else rrb.ScalarAxis(range=part.range, zoom_lock=False)
-        return rrb.TimeSeriesView(
-            name=part.name,
-            origin="/",
-            contents=[f"+ /{path}" for path in part.paths],
-            axis_y=axis,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-            time_ranges=ranges,
-        )
-    if isinstance(part, PlaneView):
-        (left, right), (top, bottom) = part.bounds
-        return rrb.Spatial2DView(
-            name=part.name,
-            origin=f"/{part.origin}",
-            background=[16, 16, 18],
-            visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
-        )
-    if part.document:
-        return rrb.TextDocumentView(name=part.name, origin=f"/{part.path}")
+    last = f"last {config.loop_s:g} s"
+    shapes = rrb.Vertical(
+        plane_view(f"What is left: error over wanted, {last}", style.DEVIATION_PLANE),
+        plane_view(f"Loop (u, y), {last}; amber: before the last change of the stage", style.LOOP_PLANE),
+        plane_view("What the learner holds: its window", style.WINDOW_PLANE),
+    )
     columns = rrb.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)], text_log_columns=["LogLevel", "Body"]
     )
-    return rrb.TextLogView(name=part.name, origin=f"/{part.path}", columns=columns)
+    health = rrb.Vertical(
+        rrb.TextLogView(name="Events", origin=f"/{style.EVENTS}", columns=columns),
+        tabs(
+            plot("Gates: samples per second", "rate/**"),
+            plot("Gates: counts", "counter/**"),
+            plot("This stream: counts", "stream/**"),
+        ),
+        tabs(
+            plot("Drift filter: gain", "drift/gain"),
+            plot("Drift filter: offset, V", "drift/offset_V"),
+            plot("Learner", "learner/**"),
+        ),
+        plot("Query latency, µs", "latency/**"),
+        rrb.TextDocumentView(name="Status", origin=f"/{style.STATUS}"),
+        row_shares=(1.0, 1.0, 0.8, 0.8, 1.0),
+    )
+    views = rrb.Horizontal(tracking, shapes, health, column_shares=(1.5, 1.0, 0.95))
+    return desk(views, rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"))
 
 
 def viewer_command(port: int, *, headless: bool = False, web_port: int | None = None) -> list[str]:
@@ -237,20 +273,9 @@ def in_order(records: Iterable[Record]) -> list[Record]:
 
 def cut(record: Tracking, piece_s: float = PIECE_S) -> Iterator[Tracking]:
     """A long `Tracking` in pieces of at most ``piece_s``."""
-    start = 0
-    edges: Sequence[int] = [
-        int(k) + 1 for k in range(len(record.seq) - 1) if record.t_s[k] // piece_s != record.t_s[k + 1] // piece_s
-    ]
-    for stop in [*edges, len(record.seq)]:
-        if stop > start:
-            part = slice(start, stop)
-            yield replace(
-                record,
-                seq=record.seq[part],
-                t_s=record.t_s[part],
-                u_V=record.u_V[part],
-                y_um=record.y_um[part],
-                reference_um=record.reference_um[part],
-                std_V=None if record.std_V is None else record.std_V[part],
-            )
-        start = stop
+    names = ("seq", "t_s", "u_V", "y_um", "reference_um", "std_V")
+    columns: dict[str, Any] = {name: getattr(record, name) for name in names if getattr(record, name) is not None}
+    edges = np.flatnonzero(np.diff(record.t_s // piece_s)) + 1
+    for part in np.split(np.arange(len(record.seq)), edges):
+        if part.size:
+            yield replace(record, **{name: column[part] for name, column in columns.items()})

@@ -11,7 +11,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
-from dehyst.service.viewer.layout import Plane, grown
+from dehyst.service.viewer.plane import Plane, grown
 from dehyst.service.viewer.records import (
     Diagnostics,
     Event,
@@ -262,7 +262,7 @@ class Scene:
 
     def _draw_planes(self, record: Tracking, main: bool, rows: FloatArray, at_s: float) -> None:
         seq = int(np.interp(at_s, record.t_s, record.seq))
-        hue = style.colour(record.model, self.config.models)
+        hue = style.colour(record.model)
         rows = rows[:: max(1, len(rows) // LOOP_POINTS)]
         y_um, wanted_um = rows[:, 2], rows[:, 3]
         plane = self._plane(style.DEVIATION_PLANE, wanted_um, wanted_um - y_um, at_s, seq)
@@ -292,11 +292,8 @@ class Scene:
     def _plane(self, name: str, x: FloatArray, y: FloatArray, t_s: float, seq: int) -> Plane | None:
         """The axes that contain these data, drawn again when they have to grow; None while nothing is finite."""
         old = self._planes.get(name)
-        x_fixed, y_fixed = None, None
-        if name == style.LOOP_PLANE:
-            x_fixed, y_fixed = self.config.u_limits_V, self.config.y_limits_um
-        x_limits = x_fixed or grown(old.x_limits if old else None, x)
-        y_limits = y_fixed or grown(old.y_limits if old else None, y)
+        x_limits = grown(old.x_limits if old else None, x)
+        y_limits = grown(old.y_limits if old else None, y)
         if x_limits is None or y_limits is None:
             return None
         if old is not None and (x_limits, y_limits) == (old.x_limits, old.y_limits):
@@ -342,7 +339,7 @@ class Scene:
         if y_um is not None and v_um_per_s is not None and y_um.size == v_um_per_s.size:
             plane = self._plane(style.WINDOW_PLANE, y_um, v_um_per_s, t_s, seq)
             if plane is not None:
-                hue = style.colour(self.config.models[0], self.config.models)
+                hue = style.colour(self.config.models[0])
                 self.canvas.points(style.WINDOW_POINTS, t_s, seq, plane.points(y_um, v_um_per_s), hue, 0.7)
 
     def _counter(self, name: str, t_s: float, seq: int, value: Any) -> None:

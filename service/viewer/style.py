@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dehyst.service.viewer.colours import MODELS, rgb
+from dehyst.service.viewer.colours import model_colour, rgb
 from dehyst.service.viewer.records import SceneConfig
 
 Colour = tuple[int, int, int]
 
-#: Colours of the known models, as in every picture.
-COLOURS: dict[str, Colour] = {model: rgb(value) for model, value in MODELS.items()}
-SPARE_COLOURS: tuple[Colour, ...] = ((213, 94, 0), (240, 228, 66), (148, 103, 189), (140, 86, 75), (23, 190, 207))
 WHITE: Colour = (235, 235, 235)
 AMBER: Colour = (255, 190, 70)
 FRAME: Colour = (70, 70, 74)
@@ -59,12 +56,9 @@ def deviation(model: str) -> str:
     return f"{DEVIATION_PLANE}/{model}"
 
 
-def colour(model: str, models: tuple[str, ...]) -> Colour:
-    """The colour of a model: its own if it is a known one, else a spare one by its place in ``models``."""
-    if model in COLOURS:
-        return COLOURS[model]
-    others = [m for m in models if m not in COLOURS]
-    return SPARE_COLOURS[others.index(model) % len(SPARE_COLOURS)] if model in others else WHITE
+def colour(model: str) -> Colour:
+    """The colour of a model, as in every picture."""
+    return rgb(model_colour(model))
 
 
 def name(model: str) -> str:
@@ -85,7 +79,7 @@ def lines(config: SceneConfig) -> dict[str, Line]:
     main = config.models[0]
     found = {REFERENCE: Line("wanted", WHITE, 1.0)}
     for model in config.models:
-        hue, called, width = colour(model, config.models), name(model), 2.0 if model == main else 1.0
+        hue, called, width = colour(model), name(model), 2.0 if model == main else 1.0
         found[displacement(model)] = Line(f"reached: {called}", hue, 2.5)
         found[voltage(model)] = Line(called, hue, width)
         for path in (error(model), mean_error(model), mean_error_log(model)):
@@ -97,5 +91,5 @@ def lines(config: SceneConfig) -> dict[str, Line]:
     found["latency/p99_us"] = Line("99th percentile", AMBER, 1.5)
     found["drift/gain"] = Line("gain", WHITE, 1.5)
     found["drift/offset_V"] = Line("offset", AMBER, 1.5)
-    found["rate/learnt"] = Line("learnt", COLOURS["lssvm_adaptive"], 2.0)
+    found["rate/learnt"] = Line("learnt", colour("lssvm_adaptive"), 2.0)
     return found

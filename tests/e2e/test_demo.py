@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import signal
 import subprocess
 import sys
@@ -58,7 +57,6 @@ def check_form(found: dict[str, Any]) -> None:
             assert 0.0 < figures["mae_pct"] <= figures["rmse_pct"] <= figures["max_pct"] < 100.0
     assert found["range_um"] > 50.0
     assert set(found["queries"]) == {"count", "p50_us", "p99_us", "late"}
-    assert found["controller"] == "follows the model"
     # Blocks that are late are computed together.
     followed, count, blocks = found["followed"], found["queries"]["count"], round(DURATION_S / 0.005)
     assert count == blocks if not followed["extrapolated"] else 5 < count <= blocks
@@ -142,18 +140,6 @@ def test_strict_keeps_real_time_and_counts_what_is_late(tmp_path: Path) -> None:
     # A stall of more than the reserve of 60 ms is told, and then the stage has held its voltage.
     assert found["ticks"]["late"] <= found["followed"]["extrapolated"]
     assert f"{found['followed']['extrapolated']} voltages from the reserve" in done.stdout
-
-
-@pytest.mark.e2e
-@pytest.mark.slow
-def test_queries_ahead_are_still_there(tmp_path: Path) -> None:
-    done = demo(tmp_path / "ahead", "--fast", "--ahead")
-    assert done.returncode == 0, done.stderr
-    found = summary(tmp_path / "ahead")
-    assert found["controller"] == "queries ahead"
-    assert found["queries"]["count"] == 5 * math.ceil(DURATION_S / 0.02)
-    assert found["followed"] == {}
-    assert "queries: 3000" in done.stdout
 
 
 @pytest.mark.e2e

@@ -158,11 +158,6 @@ def test_in_no_half_second_is_adapting_worse_whatever_happens(kind: str) -> None
         assert done.floor_um[-1] == pytest.approx(3.0 * done.floor_um[0], rel=0.05)
 
 
-def test_no_kind_is_left_out() -> None:
-    assert len(SCENARIO_KINDS) == 10
-    assert set(SCENARIO_KINDS) > ELSEWHERE
-
-
 def test_a_motion_that_begins_later_is_the_same_motion() -> None:
     motion = DemoReference(5.0, LOW_UM, 80.0, 7)
     t = np.arange(0.0, 4.0, 1e-3)

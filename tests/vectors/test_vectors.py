@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import zenoh
 
-from benchmarks import vectors
 from dehyst.adaptive.errors import InputError
 from dehyst.service.answers.answering import Served, answer
 from dehyst.service.answers.guard import Limits
@@ -28,6 +27,7 @@ from dehyst.service.protocol.query import Trajectory, decode_query, decode_reply
 from dehyst.service.protocol.samples import decode_command, decode_reference, decode_samples
 from dehyst.service.security.authenticator import Authenticator, HeardSamples
 from tests.service.protocol import page_client
+from tests.vectors import make_vectors as vectors
 
 FOLDER = vectors.DEFAULT_OUT
 TOLERANCE = 1e-12
@@ -406,7 +406,7 @@ def test_the_command_makes_the_same_vectors(tmp_path: Path) -> None:
                 compare(decode(old), decode(new))
                 break
         else:
-            pytest.fail(f"{made.name}: not the bytes of the command; run python -m benchmarks.vectors")
+            pytest.fail(f"{made.name}: not the bytes of the command; run python -m tests.vectors.make_vectors")
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> None:

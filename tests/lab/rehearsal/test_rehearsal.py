@@ -10,27 +10,13 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.lab.rehearsal import (
-    CLASSES,
-    EVENT_KINDS,
-    INTACT,
-    SENSOR,
-    Event,
-    FunctionPlant,
-    LoopRecord,
-    Plant,
-    RandomReference,
-    ReferenceRequest,
-    RehearsalConfig,
-    draw,
-    factory_of,
-    rehearse,
-)
-from dehyst.lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from dehyst.lab.rehearsal import CLASSES, EVENT_KINDS, SENSOR, Event, RehearsalConfig, draw, factory_of, rehearse
+from dehyst.lab.rehearsal.disturbance import INTACT, MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
 from dehyst.lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
-from dehyst.lab.rehearsal.plant import run_checked
-from dehyst.lab.rehearsal.reference import Excursion
+from dehyst.lab.rehearsal.plant import FunctionPlant, Plant, run_checked
+from dehyst.lab.rehearsal.reference import Excursion, RandomReference, ReferenceRequest
 from dehyst.lab.rehearsal.rehearsal import remarks, table
+from dehyst.lab.rehearsal.runs import LoopRecord
 from dehyst.service.answers.guard import Limits
 from dehyst.service.protocol.samples import MAX_SEQ
 from tests.foreign.plants import issue_plant, random_plant
@@ -121,7 +107,7 @@ def test_a_plant_that_does_not_move_is_told_of() -> None:
 # What is asked.
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_reference_belongs_together_and_keeps_to_its_band(seed: int) -> None:
     wish = ReferenceRequest(start_um=0.0, low_um=10.0, high_um=90.0, duration_s=8.0, seed=seed)
     t_s = np.arange(80_000) * 1e-4
@@ -399,15 +385,6 @@ def test_a_change_is_believed_with_the_first_sample_that_is_not_held_back() -> N
     assert np.isnan(believed((4002, n)))
 
 
-def test_jumps_are_counted_from_the_event_on() -> None:
-    still = course(np.zeros(9000), np.full(9000, 5.0))
-    jumps = np.zeros(9000, dtype=np.int64)
-    jumps[1000:], jumps[4000:], jumps[8000:] = 1, 2, 3
-    limits = Limits(0.0, 10.0, 1e4)
-    result = outcome(Event("spikes", "spikes", 4.0), replace(still, jumps=jumps), still, 100.0, limits, DT_S, "")
-    assert result.jumps == 2
-
-
 def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() -> None:
     events = [Event("none", "none", 3.0), Event("gain_fast", "gain", 3.0, 0.06, over_s=0.2)]
     factory = random_plant(3)
@@ -428,15 +405,6 @@ def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() ->
     assert json.dumps(done.as_dict(), allow_nan=False)
     assert "the stage's gain changes by +6 %" in table(done)
     assert table(done, markdown=True).count("\n") == 3
-
-
-def test_all_messages_lost_leaves_the_model_served() -> None:
-    done = rehearse(random_plant(3), config=SHORT, events=[Event("gap", "gap", 2.5, over_s=1.0)], seed=1)
-    course = done.runs[0].adaptive
-    never = course.verdict == 0
-    assert course.verdicts[0] == "never_came"
-    assert never.sum() == pytest.approx(1000, abs=1)
-    assert done.runs[0].outcome.adaptive.settled_pct < 0.5
 
 
 def test_a_stage_of_200_hz_can_be_disturbed() -> None:

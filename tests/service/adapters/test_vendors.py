@@ -39,7 +39,7 @@ def at_its_limits(stage: StageAdapter) -> None:
     assert isinstance(stage.read_um(), float)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pi_port() -> Iterator[int]:
     """The port of the simulated PI controller."""
     process = subprocess.Popen(

@@ -6,7 +6,10 @@ Endpoints are the exception: a free port takes the place of the default one, so 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import importlib.util
+import io
 import json
 import os
 import re
@@ -20,6 +23,7 @@ from pathlib import Path
 
 import pytest
 
+from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import COMMANDS, main
 from dehyst.service.cli.main import build_parser
 from tests.service.conftest import ServeProcess, unused_port
@@ -69,21 +73,27 @@ def test_a_mistyped_command_is_answered_with_the_nearest(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files that examples name, as one of them writes them into an empty folder."""
+    """The files that examples name, as one of them writes them into an empty folder, and what is made of them here."""
     folder = tmp_path_factory.mktemp("examples")
     (writing,) = [example for example in examples("stage") if "--examples" in example]
     assert "recording.csv" in run_as_printed(writing, folder)
     return folder
 
 
-def run_as_printed(example: str, folder: Path, *more: str) -> str:
+@pytest.fixture(scope="module")
+def stage(folder: Path) -> Path:
+    """The same with the models that the first example of ``identify`` writes."""
+    assert "models: stage.npz" in run_as_printed(examples("identify")[0], folder)
+    return folder
+
+
+def run_as_printed(example: str, folder: Path, *more: str, status: int = 0) -> str:
     """Run an example in ``folder``; returns what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "dehyst.lab.cli", *words(example), *more],
-        cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=600,
-    )  # fmt: skip
-    assert done.returncode == 0, f"{example}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    printed, complaint = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint):
+        ended = main([*words(example), *more])
+    assert ended == status, f"{example}\n{printed.getvalue()}\n{complaint.getvalue()}"
+    return printed.getvalue() + complaint.getvalue() * (status != 0)
 
 
 def environment() -> dict[str, str]:
@@ -97,31 +107,23 @@ def test_no_file_of_the_reader_is_replaced(folder: Path, capsys: pytest.CaptureF
     assert (folder / "scope.csv").read_bytes() == before
 
 
-def test_identify_and_replay_run_as_printed(folder: Path) -> None:
-    for example in examples("identify"):
-        (folder / "stage.npz").unlink(missing_ok=True)
-        assert "models: stage.npz" in run_as_printed(example, folder)
-        assert (folder / "stage.npz").stat().st_size > 1000
+def test_identify_and_replay_run_as_printed(stage: Path) -> None:
+    for example in examples("identify")[1:]:
+        other = example.replace("stage.npz", "other.npz")
+        assert "models: other.npz" in run_as_printed(other, stage, "--models", "linear", "--no-pictures")
     for example in examples("replay"):
-        assert "samples scored" in run_as_printed(example, folder)
+        assert "samples scored" in run_as_printed(example, stage, "--no-pictures")
 
 
-def test_export_runs_as_printed(folder: Path) -> None:
-    if not (folder / "stage.npz").exists():
-        run_as_printed(examples("identify")[0], folder)
+def test_export_runs_as_printed(stage: Path) -> None:
     for example in examples("export")[:2]:
-        assert "demo_x.c: C99" in run_as_printed(example.replace(" --fmu", ""), folder)
+        assert "demo_x.c: C99" in run_as_printed(example.replace(" --fmu", ""), stage)
 
 
 def test_look_runs_as_printed(folder: Path) -> None:
     """The first example finds two columns in V and asks; the second says which is which."""
     asking, understood = examples("look")
-    done = subprocess.run(
-        [sys.executable, "-m", "dehyst.lab.cli", *words(asking)],
-        cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "--column y=CH2" in done.stdout
+    assert "--column y=CH2" in run_as_printed(asking, folder, status=1)
     assert "understood: 12000 samples" in run_as_printed(understood, folder)
 
 
@@ -133,16 +135,26 @@ def test_modes_run_as_printed(folder: Path) -> None:
     assert [round(mode["frequency_hz"][0]) for mode in json.loads(in_json)["modes"]] == [90, 228]
 
 
-@pytest.mark.timeout(600)
-def test_a_diagnosis_runs_as_printed(folder: Path) -> None:
-    """The example that reads one period of the drive beside many of readings; it takes a minute."""
-    (periods,) = [example for example in examples("diagnose") if "--repeat" in example]
-    assert "report: out/diagnosis/report.md" in run_as_printed(periods, folder)
+@pytest.mark.parametrize(
+    ("command", "module", "work"),
+    [
+        ("diagnose", "dehyst.sim.diagnosis.diagnose", "diagnose_prepared"),
+        ("rehearse", "dehyst.lab.rehearsal", "rehearse"),
+    ],
+)
+def test_examples_that_take_minutes_are_read_as_printed(
+    command: str, module: str, work: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the work itself: files, columns, plants and events."""
 
+    def begins(*_: object, **__: object) -> None:
+        raise InputError("here the work begins")
 
-def test_a_plant_that_is_a_function_is_rehearsed_as_printed(folder: Path) -> None:
-    (example,) = [example for example in examples("rehearse") if "mine.py" in example]
-    assert "the stage rings" in run_as_printed(example, folder)
+    monkeypatch.setattr(importlib.import_module(module), work, begins)
+    for example in examples(command):
+        where = ROOT if "examples/" in example else folder
+        out = () if "--out" in example else ("--out", str(folder / "out"))
+        assert "here the work begins" in run_as_printed(example, where, *out, status=2)
 
 
 def test_examples_that_print_run_as_printed(folder: Path) -> None:
@@ -173,23 +185,21 @@ def test_examples_beside_a_service_run_as_printed(folder: Path, serve: Callable[
     _, once, check = examples("status")
     assert '"axes"' in run_as_printed(once, folder, "--endpoint", service.endpoint)
     # No samples come: the check says so by its exit status.
-    with pytest.raises(AssertionError, match="demo/x: no samples"):
-        run_as_printed(check, folder, "--endpoint", service.endpoint)
+    assert "demo/x: no samples" in run_as_printed(check, folder, "--endpoint", service.endpoint, status=1)
     for name, port in (("metrics", "9464"), ("epics", "")):
         example = examples(name)[0].replace(port or "\0", str(unused_port()))
         if name == "metrics" or importlib.util.find_spec("p4p") is not None:
             comes_up(example, folder, "--endpoint", service.endpoint)
 
 
-def test_examples_that_serve_come_up_as_printed(folder: Path) -> None:
+def test_examples_that_serve_come_up_as_printed(stage: Path) -> None:
     """Routers without and with access control, the stage, and a service with its standby."""
+    folder = stage
     shutil.rmtree(folder / "access", ignore_errors=True)  # of another test of this file
     for example in examples("access"):
         run_as_printed(example, folder)
     for example in (*examples("router"), examples("stage")[0]):
         comes_up(re.sub("74[0-9]{2}", str(unused_port()), example), folder)
-    if not (folder / "stage.npz").exists():
-        run_as_printed(examples("identify")[0], folder)
     _, primary, standby = examples("serve")
     config = folder / "serve.toml"
     text = config.read_text()
@@ -214,10 +224,3 @@ def comes_up(example: str, folder: Path, *more: str, then: Callable[[], None] = 
     finally:
         process.kill()
         process.communicate()
-
-
-def test_the_plant_of_the_example_is_there() -> None:
-    """The example of rehearse takes a minute: its file and class are checked here, its run in tests/lab/rehearsal."""
-    (plant,) = [words(e)[2] for e in examples("rehearse") if "examples/" in e]
-    path, _, name = plant.partition(":")
-    assert f"class {name}" in (ROOT / path).read_text()

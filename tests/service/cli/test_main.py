@@ -109,18 +109,18 @@ def test_bash_completes_from_the_script(tmp_path: Path) -> None:
     assert done.stdout.split() == ["--standby"], done.stderr
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "cp437", "cp932", "ascii"])
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_help_can_be_read_in_any_encoding(command: str, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-    monkeypatch.setattr(sys, "stdout", out)
-    with pytest.raises(SystemExit) as ended:
-        main([command, "--help"])
-    assert ended.value.code in (0, None)
-    out.flush()
-    text = out.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
-    assert f"usage: dehyst {command}" in text
-    assert "?m" not in text, "a unit that cannot be shown is spelt: um"
+@pytest.mark.parametrize("encoding", ["cp932", "ascii"])
+def test_help_can_be_read_in_any_encoding(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for command in COMMANDS:
+        out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        monkeypatch.setattr(sys, "stdout", out)
+        with pytest.raises(SystemExit) as ended:
+            main([command, "--help"])
+        assert ended.value.code in (0, None)
+        out.flush()
+        text = out.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+        assert f"usage: dehyst {command}" in text
+        assert "?m" not in text, "a unit that cannot be shown is spelt: um"
 
 
 def run_into(out: object, *words: str) -> tuple[int, str]:

@@ -9,38 +9,15 @@ import numpy as np
 import pytest
 
 from dehyst.lab.cli import main
-
-DT_S = 1e-3
-
-
-def write(path: Path, rms_V: float, seed: int, slope: float) -> None:
-    """Two drives, two outputs, three realisations of two periods; the second mode falls with the drive."""
-    rng = np.random.default_rng(seed)
-    lines, samples = np.arange(1, 116), 256
-    spectrum = np.zeros((samples // 2 + 1, 2, 4), dtype=complex)
-    for block in range(2):
-        phases = np.exp(2j * np.pi * rng.random((lines.size, 2)))
-        spectrum[lines, :, 2 * block] = phases
-        spectrum[lines, :, 2 * block + 1] = phases * [1.0, -1.0]
-    u = np.fft.irfft(spectrum, n=samples, axis=0)
-    factor = rms_V / np.sqrt(np.mean(u**2))
-    s = 2j * np.pi * np.arange(samples // 2 + 1) / (samples * DT_S)
-    g = np.zeros((samples // 2 + 1, 2, 2), dtype=complex)
-    for f, zeta, shape in (
-        (90.0, 0.03, [[1.0, 0.5], [0.2, 0.1]]),
-        (230.0 * (1.0 - slope * rms_V), 0.02, [[0.3, -1.0], [-0.6, 2.0]]),
-    ):
-        omega = 2.0 * np.pi * f
-        g += (omega**2 / (s**2 + 2.0 * zeta * omega * s + omega**2))[:, None, None] * np.array(shape)
-    y = np.fft.irfft(g @ (factor * spectrum), n=samples, axis=0)
-    noisy = y[..., None] + 1e-3 * rng.normal(size=(*y.shape, 2))
-    np.savez(path, u_V=np.repeat(factor * u[..., None], 2, axis=3), y_um=noisy, dt_s=DT_S)
+from dehyst.service.stage_node import example_files
 
 
 @pytest.fixture
 def recordings(tmp_path: Path) -> list[str]:
+    """Two drives, two outputs, four realisations of two periods; the second mode falls with the drive."""
     for name, rms_V, seed in (("low", 0.1, 1), ("high", 0.3, 2), ("test", 0.3, 3)):
-        write(tmp_path / f"{name}.npz", rms_V, seed, 0.05)
+        u_V, y_um = example_files._steady(2, 256, 4, 2, rms_V, seed)
+        np.savez(tmp_path / f"{name}.npz", u_V=u_V, y_um=y_um, dt_s=example_files.DT_S)
     return [str(tmp_path / f"{name}.npz") for name in ("low", "high", "test")]
 
 

@@ -197,18 +197,27 @@ def test_the_follower_passes_to_the_baseline_outside_the_domain_as_the_service_d
     np.testing.assert_array_equal(flags & ~np.uint8(STALE), asked.flags[:15])
 
 
-def test_commands_leave_within_the_limits_and_say_so(client: Client) -> None:
+def test_commands_leave_within_the_limits_and_say_so_and_references_arrive(client: Client) -> None:
     got: list[float] = []
-    subscriber = client._session.declare_subscriber(
-        client.keys.command, lambda sample: got.extend(wire.decode_command(sample.payload.to_bytes()).values.tolist())
-    )
+    wanted: list[wire.Block] = []
+    subscribers = [
+        client._session.declare_subscriber(
+            client.keys.command, lambda sample: got.extend(wire.decode_command(sample.payload.to_bytes()).values)
+        ),
+        client._session.declare_subscriber(
+            client.keys.reference, lambda sample: wanted.append(wire.decode_reference(sample.payload.to_bytes()))
+        ),
+    ]
+    client.reference(6, [3.0])
     flags = [client.command(100, [1.0, 9.0, 50.0]), client.command(103, [9.0]), client.command(110, [9.5])]
     assert [f.tolist() for f in flags] == [[0, LIMITED_SLEW, LIMITED_VOLTAGE | LIMITED_SLEW], [LIMITED_SLEW], [0]]
     until = time.monotonic() + 5.0
-    while len(got) < 5 and time.monotonic() < until:
+    while not (len(got) == 5 and wanted) and time.monotonic() < until:
         time.sleep(0.01)
     assert got == pytest.approx([1.0, 3.0, 5.0, 7.0, 9.5])
-    subscriber.undeclare()
+    assert [(block.seq, block.values.tolist()) for block in wanted] == [(6, [3.0])]
+    for subscriber in subscribers:
+        subscriber.undeclare()
 
 
 def test_the_follower_guards_what_leaves_too(client: Client) -> None:
@@ -241,7 +250,7 @@ def test_the_key_may_be_a_text(shared_service: Any) -> None:
         assert client.point(40.0).u_V > 0.0
 
 
-@pytest.mark.parametrize("wrong", ["40", None, [1.5], {}], ids=repr)
+@pytest.mark.parametrize("wrong", ["40", [1.5]], ids=repr)
 def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> None:
     for field, ask in (
         ("y_um", lambda: client.point(wrong)),
@@ -257,44 +266,16 @@ def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> N
     ):
         with pytest.raises(InputError, match=f"^{field}: got "):
             ask()
-    if wrong is not None:
-        for field in ("keep", "memory"):
-            if (field, wrong) != ("memory", [1.5]):
-                with pytest.raises(InputError, match=f"^{field}: got "):
-                    client.follow(**{field: wrong})
-        with pytest.raises(InputError, match=r"^after: got "):
-            client.trajectory([40.0], after=wrong)
-        with pytest.raises(InputError, match=r"^begin: got "):
-            client.point(40.0, begin=wrong)
-        with pytest.raises(InputError, match=r"^model: got "):
-            client.follow(wrong if wrong != "40" else 40)
-    if wrong != [1.5]:
-        with pytest.raises(InputError, match=r"^y_um: got "):
-            client.trajectory(wrong)
-
-
-def test_commands_and_references_arrive(client: Client) -> None:
-    got: dict[str, wire.Block] = {}
-    session = client._session
-    here = threading.Event()
-
-    def on_reference(sample: zenoh.Sample) -> None:
-        got["reference"] = wire.decode_reference(sample.payload.to_bytes())
-        if "command" in got:
-            here.set()
-
-    def on_command(sample: zenoh.Sample) -> None:
-        got["command"] = wire.decode_command(sample.payload.to_bytes())
-        if "reference" in got:
-            here.set()
-
-    session.declare_subscriber(client.keys.command, on_command)
-    session.declare_subscriber(client.keys.reference, on_reference)
-    client.command(5, [1.0, 2.0])
-    client.reference(6, [3.0])
-    assert here.wait(5.0)
-    assert (got["command"].seq, got["command"].values.tolist()) == (5, [1.0, 2.0])
-    assert (got["reference"].seq, got["reference"].values.tolist()) == (6, [3.0])
+    for field, ask in (
+        ("keep", lambda: client.follow(keep=wrong)),
+        ("memory", lambda: client.follow(memory="40")),
+        ("after", lambda: client.trajectory([40.0], after=wrong)),
+        ("begin", lambda: client.point(40.0, begin=wrong)),
+        ("model", lambda: client.follow(40)),  # type: ignore[arg-type]
+        ("y_um", lambda: client.trajectory("40")),
+    ):
+        with pytest.raises(InputError, match=f"^{field}: got "):
+            ask()
 
 
 def test_nobody_there(free_port: int) -> None:

@@ -249,9 +249,7 @@ def test_samples_that_do_not_belong_together_resynchronise_nothing() -> None:
     np.testing.assert_array_equal(follower.memory, before)
 
 
-@pytest.mark.parametrize(
-    "wrong", ["40", b"40", None, [1.5], np.array([1.5]), {}, 10**400], ids=lambda value: repr(value)[:12]
-)
+@pytest.mark.parametrize("wrong", ["40", None, [1.5], 10**400], ids=lambda value: repr(value)[:12])
 def test_an_argument_of_a_follower_that_is_no_number_is_named_and_changes_nothing(wrong: Any) -> None:
     follower = Follower(
         Session(), None, "lssvm_adaptive", lambda: snapshot_after(make_models()["lssvm_adaptive"], 20), LIMITS
@@ -283,7 +281,7 @@ def test_an_argument_of_a_follower_that_is_no_number_is_named_and_changes_nothin
     assert follower.point(40.0) == expected
 
 
-@pytest.mark.parametrize("memory", ["40", [[1.0]], [1.0, None], [1.0]], ids=repr)
+@pytest.mark.parametrize("memory", ["40", [1.0]], ids=repr)
 def test_a_memory_that_does_not_fit_is_refused_by_name(memory: Any) -> None:
     model = make_models()["lssvm_adaptive"]
     with pytest.raises(InputError, match=r"^memory: got "):

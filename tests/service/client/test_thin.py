@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import vectors
 from dehyst import service
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
 from dehyst.service.client.follower import Follower
 from dehyst.service.protocol.model import decode_model
+from tests.vectors import make_vectors as vectors
 
 OTHERS = (
     "numba", "llvmlite", "scipy", "pyarrow", "matplotlib", "rerun", "psutil", "threadpoolctl", "h5py", "nptdms",
@@ -153,12 +153,8 @@ COMMAND = "from dehyst.lab.cli import main\nsys.exit(main(sys.argv[1:]))"
 @pytest.mark.parametrize(
     ("arguments", "without", "package", "extras"),
     [
-        (["serve", "--example"], "numba", "numba", "serve"),
         (["stage"], "scipy", "scipy", "serve"),
-        (["view"], "rerun", "rerun", "viewer"),
-        (["diagnose", "x.csv"], "matplotlib", "matplotlib", "lab"),
         (["demo"], "rerun", "rerun", "lab,viewer"),
-        (["completion", "bash"], "shtab", "shtab", "serve"),
     ],
 )
 def test_a_command_says_what_to_install(arguments: list[str], without: str, package: str, extras: str) -> None:
@@ -168,7 +164,7 @@ def test_a_command_says_what_to_install(arguments: list[str], without: str, pack
     assert f"pip install 'dehyst[{extras}]'" in done.stderr
 
 
-@pytest.mark.parametrize("arguments", [["--version"], ["query", "--help"], ["status", "--help"], ["router", "--help"]])
+@pytest.mark.parametrize("arguments", [["query", "--help"], ["router", "--help"]])
 def test_the_commands_of_a_client_need_nothing_else(arguments: list[str]) -> None:
     done = run_without(OTHERS, COMMAND, *arguments)
     assert done.returncode == 0, done.stderr

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-import struct
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.fallback import FADE_S
@@ -21,57 +18,9 @@ from dehyst.service.protocol.query import (
     FeedforwardQuery,
     Pending,
     Trajectory,
-    decode_query,
     encode_query,
 )
 from tests.service.server.test_axis import make_axis, parts, recording
-
-FINITE = st.floats(-1e6, 1e6)
-
-
-@settings(deadline=None)
-@given(
-    first=st.integers(0, 2**62),
-    rows=st.lists(st.tuples(FINITE, FINITE), min_size=1, max_size=40),
-    model=st.sampled_from(["", "mpi", "größe"]),
-    n=st.integers(1, 5),
-)
-def test_it_comes_back_to_the_last_bit(first: int, rows: list[tuple[float, float]], model: str, n: int) -> None:
-    y, u = (np.array(column) for column in zip(*rows, strict=True))
-    query = decode_query(encode_query(np.ones(n), np.ones(n), None, None, model, pending=Pending(first, y, u)))
-    assert query.pending is not None
-    assert (query.pending.first, query.model, query.memory) == (first, model, None)
-    np.testing.assert_array_equal(query.pending.y_um, y)
-    np.testing.assert_array_equal(query.pending.u_V, u)
-    assert decode_query(encode_query(np.ones(n), np.ones(n))).pending is None
-
-
-GOOD = encode_query(1.0, 2.0, 3.0, model="mpi", pending=Pending(7, np.array([4.0, 5.0]), np.array([0.4, 0.5])))
-
-
-def test_the_layout_is_that_of_the_page() -> None:
-    head = struct.pack("<BBHIqdII", 1, 4, 5, 1, -1, math.nan, 0, 3) + struct.pack("<ddd", 1.0, 2.0, 3.0) + b"mpi"
-    assert head + struct.pack("<qIdddd", 7, 2, 4.0, 5.0, 0.4, 0.5) == GOOD
-
-
-@pytest.mark.parametrize(
-    ("payload", "field"),
-    [
-        (GOOD[:-1], "payload"),
-        (GOOD + b"\0", "payload"),
-        (GOOD[:-40], "payload"),
-        (GOOD[:-44] + struct.pack("<qI", 7, 0) + GOOD[-32:], "pending.k"),
-        (GOOD[:-44] + struct.pack("<qI", 7, 2**31) + GOOD[-32:], "pending.k"),
-        (GOOD[:-44] + struct.pack("<qI", -1, 2) + GOOD[-32:], "pending.first"),
-        (GOOD[:-8] + struct.pack("<d", math.nan), "pending.u_V[1]"),
-        (GOOD[:-32] + struct.pack("<d", math.inf) + GOOD[-24:], "pending.y_um[0]"),
-        (GOOD[:2] + struct.pack("<H", 7) + GOOD[4:], "pending"),
-    ],
-)
-def test_what_is_malformed_is_refused_by_field(payload: bytes, field: str) -> None:
-    with pytest.raises(FieldError) as refused:
-        decode_query(payload)
-    assert refused.value.field == field
 
 
 def test_unequal_columns_are_refused_before_they_are_sent() -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.service.export import Frozen
 from dehyst.service.export.c_source import CSource, c_source
+from dehyst.service.export.exporting import Frozen
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 needs_a_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc) on this machine")

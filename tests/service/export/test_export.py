@@ -15,8 +15,7 @@ import pytest
 from dehyst.lab.cli import main
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
-from dehyst.service.export import Frozen, write_export
-from dehyst.service.export.exporting import Periodic, trial_motion, voltages
+from dehyst.service.export.exporting import Frozen, Periodic, trial_motion, voltages, write_export
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, ServeProcess, make_models
 from tests.service.export.compiled import STRICT, needs_a_compiler

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import subprocess
@@ -218,6 +219,7 @@ def test_the_page_of_a_record_without_a_named_cause(tmp_path: Path) -> None:
 # ---- curves and words, without a diagnosis
 
 
+@functools.cache
 def settings() -> dict[str, FitData]:
     """A record with steps and holds, one of a sine alone, and one of a noisy drive."""
     rng = np.random.default_rng(3)

@@ -17,28 +17,22 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.commands.stage import parse_change
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import SURELY, open_client
 from dehyst.service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
 from dehyst.service.stage_node.faults import fault_key
-from dehyst.service.stage_node.node import NodeConfig, status_key
+from dehyst.service.stage_node.node import status_key
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
+from tests.service.conftest import unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 @contextmanager
 def stage_process(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    endpoint = free_endpoint()
+    endpoint = f"tcp/127.0.0.1:{unused_port()}"
     command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -265,18 +259,6 @@ def test_command_buffer_takes_by_number_and_holds_what_is_missing() -> None:
         buffer.put(wire.Block(40, np.zeros(17)))
 
 
-def test_change_option() -> None:
-    assert parse_change("30:gain_drift.gain=-0.06,resonance.payload_ratio=1") == (
-        30.0,
-        {"gain_drift.gain": -0.06, "resonance.payload_ratio": 1.0},
-    )
-
-
-def test_bad_node_configuration() -> None:
-    with pytest.raises(InputError, match="ticks: got 0"):
-        NodeConfig(preset("rich"), "t", ("x",), ticks=0)
-
-
 def test_stage_file_and_options_make_the_configuration(tmp_path: Path) -> None:
     import argparse
 
@@ -297,18 +279,18 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
     sent: list[wire.SampleBatch] = []
     flowing = threading.Event()
 
-    def put(payload: bytes) -> None:
+    def put(*columns: np.ndarray) -> None:
         flowing.wait(10.0)
-        sent.append(wire.decode_samples(payload))
+        sent.append(wire.SampleBatch(*columns))
 
-    ring = SampleRing(0.001, put)
-    sender = Sender([ring], lambda: None)
-    ring.write(0, 0.0, 0.0)
+    ring = SampleRing(put)
+    sender = Sender([ring])
+    ring.write(0, 0.0, 0.0, 0.0)
     sender.wake()
     start = time.monotonic()
     n = RING_SIZE + 5000
     for k in range(1, n):
-        ring.write(k, float(k), -float(k))
+        ring.write(k, 1e-3 * k, float(k), -float(k))
         sender.wake()
     assert time.monotonic() - start < 5.0
     flowing.set()

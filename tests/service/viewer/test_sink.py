@@ -17,6 +17,7 @@ import pytest
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
+from dehyst.service.viewer import style
 from dehyst.service.viewer.output import Output, OutputConfig
 from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
 from dehyst.service.viewer.rerun_sink import write_recording
@@ -94,16 +95,19 @@ def test_an_offline_run_reads_back_with_every_value(tmp_path: Path) -> None:
     assert "stage" in others["status:TextDocument:text"][0][0]
 
 
-def test_the_blueprint_in_the_file_names_its_views(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-    write_recording(path, SceneConfig("demo/x", MODELS), a_run(100))
+def test_the_blueprint_in_the_file_shows_every_curve_that_has_a_name(tmp_path: Path) -> None:
+    path, config = tmp_path / "run.rrd", SceneConfig("demo/x", MODELS)
+    write_recording(path, config, a_run(100))
     _, _, reader = read_back(path)
-    names = set()
+    texts: set[str] = set()
     for chunk in reader.stream(store=reader.blueprints()[0]):
         batch = chunk.to_record_batch()
-        for column in (c for c in batch.schema.names if c.endswith("display_name")):
-            names |= {text for row in batch.column(column).to_pylist() if row for text in row}
-    assert {"Tracking error, µm", "Displacement: wanted and reached, µm", "Query latency, µs", "Events"} <= names
+        for column in (c for c in batch.schema.names if c.endswith(("display_name", "ViewContents:query"))):
+            texts |= {text for row in batch.column(column).to_pylist() if row for text in row}
+    assert {"Tracking error, µm", "Displacement: wanted and reached, µm", "Query latency, µs", "Events"} <= texts
+    for curve in style.lines(config):
+        if curve != style.displacement("linear"):
+            assert {f"+ /{curve}", f"+ /{curve.split('/')[0]}/**"} & texts, curve
 
 
 def test_a_file_that_cannot_be_written_is_refused_by_name(tmp_path: Path) -> None:
@@ -227,6 +231,7 @@ def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:
 KILLED = """
 import os, signal, struct, sys
 from pathlib import Path
+from dehyst.service.viewer import style
 from dehyst.service.viewer.output import Output, OutputConfig
 from dehyst.service.viewer.records import SceneConfig
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Make the test vectors of the protocol: payloads as they go over the wire, and the answers of the service to them.
 
-``python -m benchmarks.vectors [--out docs/protocol/vectors]``. Everything comes from one seed. Parameters of
+``python -m tests.vectors.make_vectors [--out docs/protocol/vectors]``. Everything comes from one seed. Parameters of
 models, and motions, are plain arithmetic and the same bytes on every machine; the last bits of memories and answers
 depend on the processor. docs/protocol.md ("Test vectors") describes the files.
 """
@@ -58,7 +58,7 @@ DOMAIN: Final = Domain(*Y_UM, 2e4)
 #: Frame of a stage whose gain has dropped by 6 % and whose zero has moved.
 JUMPED: Final = {"gain": 0.94, "offset_um": 1.8}
 LEARNING: Final = "lssvm_adaptive"
-DEFAULT_OUT: Final = Path(__file__).resolve().parents[1] / "docs" / "protocol" / "vectors"
+DEFAULT_OUT: Final = Path(__file__).resolve().parents[2] / "docs" / "protocol" / "vectors"
 COLUMNS: Final = "case model query reply continues u_min_V u_max_V slew_V_per_s y_min_um y_max_um age_s"
 
 
