@@ -1,7 +1,7 @@
 """Operator's commands: requests over zenoh, their journal, and the table of statuses (docs/operating.md).
 
 `operate` sends a command and `statuses` collects the statuses of all instances; `screen` shows them. `OperationsServer`
-takes the commands of one axis, runs its `Verbs` and writes them to a `Journal`. The names are loaded on first use.
+takes the commands of one axis, runs its verbs and writes them to a `Journal`. The names are loaded on first use.
 """
 
 from __future__ import annotations
@@ -18,6 +18,5 @@ if TYPE_CHECKING:
     from dehyst.service.operating.server import Journal as Journal
     from dehyst.service.operating.server import OperationsServer as OperationsServer
     from dehyst.service.operating.verbs import Request as Request
-    from dehyst.service.operating.verbs import Verbs as Verbs
 
 __getattr__ = lazy_names(__name__)

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
@@ -53,6 +53,9 @@ from dehyst.service.server.learner_supervisor import (
     stored_model,
 )
 from dehyst.service.server.moves import Moves
+
+if TYPE_CHECKING:
+    from dehyst.service.storage.checkpoint import CheckpointFolder
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
 
@@ -150,21 +153,6 @@ class EventLimiter:
 STAND_INS: Final = ("mpi", "linear", "bouc_wen")
 
 
-class Archive(Protocol):
-    """Where the checkpoints of an axis are kept."""
-
-    def entries(self) -> list[dict[str, Any]]:
-        """The checkpoints, newest first."""
-        ...
-
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint, whose state passes ``check``.
-
-        Raises FieldError if there is none with this number, or it does not fit.
-        """
-        ...
-
-
 class SampleCounts(NamedTuple):
     """Counts of one moment: number of the last sample handled, samples by order of arrival, samples by verdict; those
     that were refused for their number, and of these the ones that contradict what came before."""
@@ -236,7 +224,7 @@ class Axis:
         revive: Revive | None = None,
         *,
         stage: str = "",
-        archive: Archive | None = None,
+        archive: CheckpointFolder | None = None,
         warnings: Mapping[str, str] | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
@@ -262,7 +250,8 @@ class Axis:
         self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.
         self.handled_seq = -1
-        self._archive = archive
+        #: The checkpoints that an operator can go back to; None where none are kept.
+        self.archive = archive
         self._identified = {name: model for name, model in models.items() if name != AUTO}
         #: Whose its files are, see `service.storage.owner`.
         self.owner = f"{stage}/{config.name}"
@@ -410,7 +399,7 @@ class Axis:
 
     def checkpoints(self) -> list[dict[str, Any]]:
         """The checkpoints, newest first: checkpoint, seq, samples, time_unix_s, bytes."""
-        return [] if self._archive is None else self._archive.entries()
+        return [] if self.archive is None else self.archive.entries()
 
     def adopt_at(self, *retuned: Retuned) -> None:
         """Let the learner adopt hyper-parameters, each right after its sample."""
@@ -599,9 +588,9 @@ class Axis:
 
         Raises FieldError if there is no such checkpoint or it does not fit.
         """
-        if self._archive is None or self.learner is None:
+        if self.archive is None or self.learner is None:
             raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
-        learner = self._archive.learner_of(checkpoint, self.learner)
+        learner = self.archive.learner_of(checkpoint, self.learner)
         self.supervisor.replace(learner)
         newest = self.newest
         changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}

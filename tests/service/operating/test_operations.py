@@ -26,7 +26,7 @@ from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
 from dehyst.service.operating.remote import operate, screen, statuses, table
 from dehyst.service.operating.server import RESERVE, Journal, OperationsServer, Switch
-from dehyst.service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
+from dehyst.service.operating.verbs import MAX_BYTES, Request, axis_verbs, decode_request, encode_request
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from dehyst.service.protocol.keys import Keys
@@ -79,15 +79,12 @@ class FakeAxis:
 
 def make(axis: FakeAxis, folder: Path | None, role: str = "primary") -> tuple[OperationsServer, list[tuple[str, str]]]:
     events: list[tuple[str, str]] = []
-    verbs = Verbs(
-        axis,
-        lambda work: work(axis),
-        {"retune": lambda: lambda arguments: {"started": True, "job": 3}, "diagnose": lambda: None},
-    )
+    background = {"retune": lambda: lambda arguments: {"started": True, "job": 3}, "diagnose": lambda: None}
+    verbs = axis_verbs(axis, lambda work: work(), background, lambda: frozenset({3}))
     journal = Journal(folder, wall_s=lambda: 1234.5)
     return OperationsServer(
         KEYS, "i1-00", verbs, journal, lambda name, detail: events.append((name, detail)), lambda: role,
-        authenticator=own_authenticator(),
+        background=tuple(background), authenticator=own_authenticator(),
     ), events  # fmt: skip
 
 
@@ -369,8 +366,7 @@ def test_an_answer_says_whether_it_outlives_a_crash(tmp_path: Path) -> None:
         server, _ = make(FakeAxis(), folder)
         assert json.loads(server.handle(ask("freeze")))["durable"] is durable
     settled = OperationsServer(
-        KEYS, "i1-00", Verbs(FakeAxis(), lambda work: work(FakeAxis()), {}), Journal(None), lambda *_: None,
-        settle=lambda: True,
+        KEYS, "i1-00", {"freeze": lambda request: (41, {})}, Journal(None), lambda *_: None, settle=lambda: True
     )  # fmt: skip
     assert json.loads(settled.handle(ask("freeze")))["durable"] is True
 

@@ -21,14 +21,12 @@ from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel, Sample
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sequence import RESTART_AFTER
-from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
 from dehyst.service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
 from dehyst.service.server.axis import Axis, EventLimiter, EventLog
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
-from dehyst.service.server.query_answers import LatencyMeter
-from dehyst.service.server.status import axis_status
+from dehyst.service.server.status import axis_fields
 from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.axes import loop_of
@@ -380,8 +378,7 @@ def give(loop: AxisLoop, first: int, n: int) -> None:
 
 def told(loop: AxisLoop) -> dict[str, Any]:
     """The learner's counters as a client reads them."""
-    status = axis_status(Keys("demo", "x"), "one", loop, LatencyMeter())
-    counters: dict[str, Any] = json.loads(json.dumps(status, allow_nan=False))["learner"]
+    counters: dict[str, Any] = json.loads(json.dumps(axis_fields(loop), allow_nan=False))["learner"]
     return counters
 
 
@@ -403,7 +400,7 @@ def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseMo
         name: count for name, count in first.items() if name.startswith("window_")
     }
     assert first["window_steps"] > 100
-    quality = axis_status(Keys("demo", "x"), "one", loop, LatencyMeter())["quality"]
+    quality = axis_fields(loop)["quality"]
     assert quality["window_cholesky"] == float(window.form == "cholesky")
     assert 0.0 <= quality["window_residual_V"] < 1e-6
     assert first["window_residual_rounds"] >= 1

@@ -20,7 +20,7 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sample_queue import SampleQueue
-from dehyst.service.operating.verbs import Request, Verbs
+from dehyst.service.operating.verbs import Request, axis_verbs
 from dehyst.service.protocol.model import digests, fingerprint
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
@@ -197,10 +197,11 @@ def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     keeper = CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", kept, clock=lambda: now_s[0])
     axis_with_list = SimpleNamespace(handled_seq=0, checkpoints=kept.entries)
-    verbs = Verbs(axis_with_list, lambda work: 0, {}, keeper.keep_listed)  # type: ignore[arg-type]
+    verbs = axis_verbs(axis_with_list, lambda work: 0, {}, keeper.keep_listed)  # type: ignore[arg-type]
 
     def listed() -> set[int]:
-        return {entry["checkpoint"] for entry in verbs.apply(Request("checkpoints", "alice"))[1]["checkpoints"]}
+        _, result = verbs["checkpoints"](Request("checkpoints", "alice"))
+        return {entry["checkpoint"] for entry in result["checkpoints"]}
 
     first = listed()
     assert len(first) > 5
