@@ -13,7 +13,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from dehyst.service.background.retuning_worker import pack, start_job
 from dehyst.service.background.settings import RetuningConfig
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.storage.output import append_line
+
+if TYPE_CHECKING:
+    from dehyst.service.server.axis import Axis
 
 # --- Adoptions of hyper-parameters, each at a definite sample: announced, stored, read and applied.
 #
@@ -138,25 +141,6 @@ _NEWEST: Final = 200
 IDLE, PROPOSING, WAITING, TRYING = "idle", "proposing", "waiting for fresh samples", "trying"
 
 
-class TunedAxis(Protocol):
-    """What a retuner needs of an axis."""
-
-    dt_s: float
-
-    @property
-    def learner(self) -> OnlineModel | None: ...
-
-    @property
-    def learning(self) -> bool: ...
-
-    @property
-    def frozen(self) -> bool: ...
-
-    def note(self, event: str, detail: str, **more: Any) -> None: ...
-
-    def adopt_at(self, *retuned: Retuned) -> None: ...
-
-
 class Retuner:
     """The re-tuning of one axis. Call `step` and `leave` in the thread that handles samples, the rest in any thread.
 
@@ -203,7 +187,7 @@ class Retuner:
         """For the status: the state, counts, and how the last re-tuning ended."""
         return {"state": self._state, "period_s": self.config.period_s, **self._counts, "last": self._last}
 
-    def step(self, axis: TunedAxis) -> None:
+    def step(self, axis: Axis) -> None:
         """Continue a running re-tuning, or begin a due one. Never blocks; call it after each message of samples."""
         learner = axis.learner
         if learner is None or not axis.learning or learner.seq < 0:
@@ -234,7 +218,7 @@ class Retuner:
         if self._job is not None:
             self._job.cancel()
 
-    def _begin(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
+    def _begin(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
         due = self.config.period_s > 0.0 and now_s - self._since_s >= self.config.period_s
         if math.isnan(self._since_s) or now_s < self._since_s:
             self._since_s, self._taught = now_s, _taught(learner)
@@ -265,7 +249,7 @@ class Retuner:
         else:
             self._end(now_s, "unchanged", "nothing better was found")
 
-    def _try(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
+    def _try(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
         if 0.0 <= now_s - self._look_s < _LOOK_S:
             return
         self._look_s = now_s
@@ -298,7 +282,7 @@ class Retuner:
                 self._known.add(row)
                 self._fresh.append(row)
 
-    def _take_trial(self, axis: TunedAxis, learner: OnlineModel, result: dict[str, Any], now_s: float) -> None:
+    def _take_trial(self, axis: Axis, learner: OnlineModel, result: dict[str, Any], now_s: float) -> None:
         told = (
             f"{1e3 * result['after_V']:.3g} mV rms on {result['fresh']} fresh samples, "
             f"{1e3 * result['before_V']:.3g} mV as it is"

@@ -413,7 +413,7 @@ def test_a_state_includes_a_switch_whatever_the_clock_does(state: State, include
 
 
 STATUS: dict[str, Any] = {
-    "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "served": "lssvm_adaptive",
+    "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "state": "ok", "served": "lssvm_adaptive",
     "learning": "lssvm_adaptive", "seq": 12345, "sample_age_s": 0.01, "refused": {"messages": 3},
     "samples": {"learnt": 9000, "lost": 2, "dropped": 0, "gates": {"learnt": 9000, "saturated": 70, "late": 5}},
     "queries": {"count": 88, "errors": 1, "p50_us": 101.4, "p99_us": 240.0},
@@ -421,7 +421,7 @@ STATUS: dict[str, Any] = {
 
 
 def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing() -> None:
-    frozen = {**STATUS, "axis": "y", "frozen": True, "role": "standby"}
+    frozen = {**STATUS, "axis": "y", "state": "frozen", "role": "standby"}
     lines = table([STATUS, frozen, {"stage": "a", "axis": "b", "instance": "c"}]).splitlines()
     assert len(lines) == 4
     for word in ("demo/x", "i1-ab", "primary", "ok", "lssvm_adaptive", "12345", "9000", "101", "240", "saturated:70"):
