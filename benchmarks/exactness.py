@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.latency_setup import CONNECT_S, LatencySetup, RunningSetup
 from benchmarks.sample_feed import AXIS, STAGE, sent
 from dehyst.adaptive.types import StateDict
-from dehyst.service.background.retuner import Retuned
+from dehyst.service.background.adoptions import Retuned
 from dehyst.service.client.client import Client
 from dehyst.service.config.settings import AxisConfig, read_config
 from dehyst.service.failover.state_transfer import fetch_state

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import zenoh
 
@@ -24,10 +24,6 @@ from dehyst.service.protocol.errors import FieldError, ServiceError, error_to_js
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.security.authenticator import NO_KEY, Authenticator
 from dehyst.service.storage.output import append_line
-
-if TYPE_CHECKING:
-    from dehyst.service.server.axis import Axis
-    from dehyst.service.storage.checkpoint import CheckpointMeta
 
 # --- The journal of operations: one JSON line per operation in a folder of the axis.
 
@@ -59,21 +55,19 @@ class Switch:
     time_unix_s: float
     instance: str = ""
 
-    def is_in(self, state: CheckpointMeta) -> bool:
-        """Whether ``state``, of the same axis, was copied after it: then it includes it.
+    @property
+    def freezes(self) -> bool:
+        """Whether it is a *freeze*."""
+        return self.verb == FREEZE
+
+    def is_in(self, samples: int, time_unix_s: float, instance: str) -> bool:
+        """Whether a state of the same axis, copied after ``samples`` by ``instance``, was copied after it.
 
         In one process the counts of samples tell it, whatever the clock does; between two the time does.
         """
-        if self.instance and self.instance == state.instance and self.samples != state.samples:
-            return self.samples < state.samples
-        return self.time_unix_s < state.time_unix_s
-
-    def apply(self, axis: Axis) -> None:
-        """Freeze or thaw ``axis`` unless it is so already."""
-        if self.verb == FREEZE and not axis.frozen:
-            axis.freeze(self.who)
-        elif self.verb == THAW and axis.frozen:
-            axis.thaw(self.who)
+        if self.instance and self.instance == instance and self.samples != samples:
+            return self.samples < samples
+        return self.time_unix_s < time_unix_s
 
 
 class Journal:

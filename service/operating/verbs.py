@@ -1,16 +1,13 @@
-"""The commands (verbs) of an operator to an axis."""
+"""The request of an operator, and what carries it out."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from dehyst.service.protocol.errors import FieldError, ServiceError
-
-if TYPE_CHECKING:
-    from dehyst.service.server.axis import Axis
+from dehyst.service.protocol.errors import FieldError
 
 # --- The request of an operator: JSON, decoded strictly.
 
@@ -100,55 +97,3 @@ def _no_constant(text: str) -> float:
 Outcome = tuple[int, dict[str, Any]]
 #: Carries out a request. Raises InputError if it is not valid, ServiceError if it is not possible now.
 Verb = Callable[[Request], Outcome]
-#: Starts background work: takes the arguments of the request, returns what was started.
-Background = Callable[[dict[str, Any]], dict[str, Any]]
-
-
-def axis_verbs(
-    axis: Axis,
-    between: Callable[[Callable[[], int]], int],
-    background: Mapping[str, Callable[[], Background | None]],
-    listed: Callable[[], frozenset[int]],
-) -> dict[str, Verb]:
-    """The verbs of one axis, by name.
-
-    ``between`` : runs work on it between two batches of samples, in the thread of the axis. ``background`` : by verb,
-    returns what starts the work; None if the configuration switches it off. ``listed`` : keeps checkpoints for the
-    operator who asks for them, and gives their numbers.
-    """
-
-    def freeze(request: Request) -> Outcome:
-        take(request.arguments)
-        return between(lambda: axis.freeze(request.who)), {}
-
-    def thaw(request: Request) -> Outcome:
-        take(request.arguments)
-        return between(lambda: axis.thaw(request.who)), {}
-
-    def select(request: Request) -> Outcome:
-        (model,) = take(request.arguments, model=str)
-        return between(lambda: axis.select(model, request.who)), {"served": model}
-
-    def rollback(request: Request) -> Outcome:
-        (checkpoint,) = take(request.arguments, checkpoint=int)
-        return between(lambda: axis.rollback(checkpoint, request.who)), {"checkpoint": checkpoint}
-
-    def checkpoints(request: Request) -> Outcome:
-        take(request.arguments)
-        kept = listed()
-        return axis.handled_seq, {"checkpoints": [one for one in axis.checkpoints() if one["checkpoint"] in kept]}
-
-    def start(request: Request) -> Outcome:
-        begin = background[request.verb]()
-        if begin is None:
-            raise ServiceError(f"{request.verb} is switched off in the service's configuration")
-        return axis.handled_seq, begin(dict(request.arguments))
-
-    own: dict[str, Verb] = {
-        "freeze": freeze,
-        "thaw": thaw,
-        "select": select,
-        "rollback": rollback,
-        "checkpoints": checkpoints,
-    }
-    return own | dict.fromkeys(background, start)

@@ -15,7 +15,6 @@ from dehyst.service.background.watcher import Watcher
 from dehyst.service.failover.state_transfer import tell_standbys
 from dehyst.service.intake.sample_queue import SampleQueue
 from dehyst.service.operating.server import Journal, OperationsServer
-from dehyst.service.operating.verbs import Background, axis_verbs
 from dehyst.service.protocol.container import to_json
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.samples import VERSION, decode_samples
@@ -25,12 +24,13 @@ from dehyst.service.security.lease import Holders
 from dehyst.service.security.refusals import refusal_counters
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.axis_verbs import Background, axis_verbs
 from dehyst.service.server.deltas import DeltaStreams
 from dehyst.service.server.health import Arrivals, DiskFailures, Health, SampleLosses, Staleness
 from dehyst.service.server.long_queries import LongQueries
 from dehyst.service.server.query_answers import LatencyMeter, QueryAnswers
 from dehyst.service.server.status import Publications, WriteRate, axis_fields
-from dehyst.service.storage.checkpoint import CheckpointKeeper
+from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 from dehyst.service.storage.recorder import Recorder, RecorderConfig
 
 PRIMARY: Final = "primary"
@@ -100,7 +100,12 @@ class AxisServer:
         if config.recorder is not None:
             settings = RecorderConfig(config.recorder, axis.owner, max_bytes=config.recorder_bytes)
             recorder = Recorder(settings, hold_s=HOLD_S)
-        self.checkpoints = CheckpointKeeper(axis, queue, keys.stage, instance, axis.archive)
+        folder = None
+        if config.checkpoints is not None:
+            folder = CheckpointFolder(
+                config.checkpoints, keys.stage, keys.axis, axis.dt_s, axis.identified, config.checkpoints_kept
+            )
+        self.checkpoints = CheckpointKeeper(axis, queue, keys.stage, instance, folder)
         watcher = Watcher(axis, config.diagnosis) if config.diagnosis.enabled else None
         tuned = config.retuning.enabled and axis.learner is not None
         retuner = Retuner(config.retuning, config.recorder) if tuned else None
@@ -228,7 +233,7 @@ class AxisServer:
         return OperationsServer(
             self.keys,
             self.instance,
-            axis_verbs(self.axis, self._operate, background, self.checkpoints.keep_listed),
+            axis_verbs(self.axis, self.checkpoints, self._operate, background),
             self.journal(),
             self.axis.note,
             lambda: self.role,

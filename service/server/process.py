@@ -95,7 +95,7 @@ def _restore(server: AxisServer) -> None:
     switch = server.journal().last_switch()
     number = None if folder is None else restore_newest(axis, folder, axis.config.recorder, switch)
     if number is None and switch is not None:
-        switch.apply(axis)
+        axis.set_frozen(switch.freezes, switch.who)
     if sink is not None:
         sink.rebase(axis.sequence.received)
 
