@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -38,28 +38,15 @@ class Limits:
 
     def to_json(self) -> dict[str, Any]:
         """For the status: infinite limits, which JSON cannot say, become null."""
-        return {
-            name: value if math.isfinite(value) else None
-            for name, value in (
-                ("u_min_V", self.u_min_V),
-                ("u_max_V", self.u_max_V),
-                ("slew_V_per_s", self.slew_V_per_s),
-                ("y_min_um", self.y_min_um),
-                ("y_max_um", self.y_max_um),
-            )
-        }
+        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Limits:
         """The limits in a status. Raises InputError where they are not acceptable."""
+        none = {"slew_V_per_s": math.inf, "y_min_um": -math.inf, "y_max_um": math.inf}
         try:
-            return cls(
-                float(data["u_min_V"]),
-                float(data["u_max_V"]),
-                math.inf if data["slew_V_per_s"] is None else float(data["slew_V_per_s"]),
-                -math.inf if data["y_min_um"] is None else float(data["y_min_um"]),
-                math.inf if data["y_max_um"] is None else float(data["y_max_um"]),
-            )
+            given = {one.name: data[one.name] for one in fields(cls)}
+            return cls(**{name: none[name] if value is None else float(value) for name, value in given.items()})
         except (KeyError, TypeError, ValueError) as error:
             raise FieldError("limits", repr(data)[:200], "the five limits of an axis") from error
 

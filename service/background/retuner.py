@@ -7,154 +7,27 @@ so that a replay and a standby compute the same snapshots.
 
 from __future__ import annotations
 
-import json
 import math
 import threading
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.types import Hyperparameters, OnlineModel, WindowData
+from dehyst.service.background.adoptions import Retuned, append_adoption
 from dehyst.service.background.job import BackgroundJob
 from dehyst.service.background.retuning_worker import pack, start_job
 from dehyst.service.background.settings import RetuningConfig
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.storage.output import append_line
-
-# --- Adoptions of hyper-parameters, each at a definite sample: announced, stored, read and applied.
-#
-# The file ``retuned.jsonl`` beside a recording holds one line per adoption. A replay applies them at the same samples
-# and gives the same snapshots bit by bit, however long the background work took.
-
-ADOPTIONS_FILE: Final = "retuned.jsonl"
-
-
-@dataclass(frozen=True, slots=True)
-class Retuned:
-    """Hyper-parameters that take effect right after the sample with the number ``seq``.
-
-    ``seq`` continues when a stage restarts its count, as the number in the learner does.
-    """
-
-    seq: int
-    gamma: float
-    widths: tuple[float, ...]
-
-    @property
-    def hyper(self) -> Hyperparameters:
-        return Hyperparameters(self.gamma, self.widths)
-
-    def to_json(self) -> dict[str, Any]:
-        """As written into the event and the file; floating-point numbers are restored exactly."""
-        return {"seq": self.seq, "gamma": self.gamma, "widths": list(self.widths)}
-
-    @classmethod
-    def from_json(cls, values: Any, where: str = "retuned") -> Retuned:
-        """Inverse of :meth:`to_json`. Raises InputError naming the field."""
-        if not isinstance(values, dict):
-            raise FieldError(where, repr(values)[:80], "an object with seq, gamma and widths")
-        seq, gamma, widths = (values.get(name) for name in ("seq", "gamma", "widths"))
-        if not isinstance(seq, int) or isinstance(seq, bool):
-            raise FieldError(f"{where}.seq", repr(seq), "an integer")
-        if not isinstance(widths, list) or not widths:
-            raise FieldError(f"{where}.widths", repr(widths)[:80], "a list of one or more numbers")
-        for name, value in (("gamma", gamma), *((f"widths[{i}]", width) for i, width in enumerate(widths))):
-            if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < math.inf:
-                raise FieldError(f"{where}.{name}", repr(value)[:80], "a positive number")
-        return cls(seq, float(gamma), tuple(float(width) for width in widths))  # type: ignore[arg-type]
-
-
-class Adoptions:
-    """Pending adoptions of an axis. Any thread may add; the thread that handles samples applies.
-
-    Attributes
-    ----------
-    pending : those that wait, in the order of their samples. adopted, refused : counts of the others.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        # Replaced as a whole, so that the check at each sample needs no lock.
-        self.pending: tuple[Retuned, ...] = ()
-        self.adopted = 0
-        self.refused = 0
-
-    def add(self, *retuned: Retuned) -> None:
-        """Schedule adoptions at their samples; one whose sample has passed is applied at the next sample."""
-        with self._lock:
-            merged = {entry.seq: entry for entry in (*self.pending, *retuned)}
-            self.pending = tuple(merged[seq] for seq in sorted(merged))
-
-    def apply(self, seq: int, learner: OnlineModel) -> list[tuple[Retuned, str]]:
-        """Apply the adoptions due after the sample ``seq``; returns each with "" or the reason for a refusal."""
-        if not self.pending or self.pending[0].seq > seq:
-            return []
-        with self._lock:
-            due = [entry for entry in self.pending if entry.seq <= seq]
-            self.pending = self.pending[len(due) :]
-        done = []
-        for entry in due:
-            refused = learner.adopt(entry.hyper)
-            self.adopted += not refused
-            self.refused += bool(refused)
-            done.append((entry, refused))
-        return done
-
-
-def append_adoption(folder: Path, retuned: Retuned) -> None:
-    """Append an adoption to the file in the folder of a recording and sync it to the disk. Raises OSError."""
-    append_line(folder / ADOPTIONS_FILE, json.dumps(retuned.to_json()).encode() + b"\n")
-
-
-def read_adoptions(folder: Path | str) -> Sequence[Retuned]:
-    """The adoptions of a recording, in order; empty without a file. Raises InputError on a damaged line."""
-    path = Path(folder) / ADOPTIONS_FILE
-    if not path.is_file():
-        return []
-    found = []
-    lines = path.read_text(encoding="utf-8").split("\n")
-    for number, line in enumerate(lines, 1):
-        if not line:
-            continue
-        try:
-            values = json.loads(line)
-        except ValueError as error:
-            if number == len(lines):
-                break  # cut off by a crash
-            raise FieldError(f"{path}:{number}", line[:80], "a line of JSON") from error
-        found.append(Retuned.from_json(values, f"{path}:{number}"))
-    return found
-
-
-# --- The re-tuning of an axis.
+from dehyst.service.server.axis import Axis
 
 #: Interval at which the window is read while fresh samples are awaited, s of samples, and samples read each time.
 _LOOK_S: Final = 0.25
 _NEWEST: Final = 200
 IDLE, PROPOSING, WAITING, TRYING = "idle", "proposing", "waiting for fresh samples", "trying"
-
-
-class TunedAxis(Protocol):
-    """What a retuner needs of an axis."""
-
-    dt_s: float
-
-    @property
-    def learner(self) -> OnlineModel | None: ...
-
-    @property
-    def learning(self) -> bool: ...
-
-    @property
-    def frozen(self) -> bool: ...
-
-    def note(self, event: str, detail: str, **more: Any) -> None: ...
-
-    def adopt_at(self, *retuned: Retuned) -> None: ...
 
 
 class Retuner:
@@ -203,7 +76,7 @@ class Retuner:
         """For the status: the state, counts, and how the last re-tuning ended."""
         return {"state": self._state, "period_s": self.config.period_s, **self._counts, "last": self._last}
 
-    def step(self, axis: TunedAxis) -> None:
+    def step(self, axis: Axis) -> None:
         """Continue a running re-tuning, or begin a due one. Never blocks; call it after each message of samples."""
         learner = axis.learner
         if learner is None or not axis.learning or learner.seq < 0:
@@ -234,7 +107,7 @@ class Retuner:
         if self._job is not None:
             self._job.cancel()
 
-    def _begin(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
+    def _begin(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
         due = self.config.period_s > 0.0 and now_s - self._since_s >= self.config.period_s
         if math.isnan(self._since_s) or now_s < self._since_s:
             self._since_s, self._taught = now_s, _taught(learner)
@@ -265,7 +138,7 @@ class Retuner:
         else:
             self._end(now_s, "unchanged", "nothing better was found")
 
-    def _try(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
+    def _try(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
         if 0.0 <= now_s - self._look_s < _LOOK_S:
             return
         self._look_s = now_s
@@ -298,7 +171,7 @@ class Retuner:
                 self._known.add(row)
                 self._fresh.append(row)
 
-    def _take_trial(self, axis: TunedAxis, learner: OnlineModel, result: dict[str, Any], now_s: float) -> None:
+    def _take_trial(self, axis: Axis, learner: OnlineModel, result: dict[str, Any], now_s: float) -> None:
         told = (
             f"{1e3 * result['after_V']:.3g} mV rms on {result['fresh']} fresh samples, "
             f"{1e3 * result['before_V']:.3g} mV as it is"

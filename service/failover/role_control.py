@@ -15,7 +15,7 @@ import zenoh
 from dehyst.adaptive.errors import DehystError, ModelFileError
 from dehyst.service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
 from dehyst.service.failover.state_transfer import fetch_state, status_of
-from dehyst.service.operating.server import FREEZE, THAW, Switch
+from dehyst.service.operating.server import FREEZE, THAW
 from dehyst.service.operating.verbs import MAX_WHO
 from dehyst.service.protocol.container import fields_of
 from dehyst.service.protocol.keys import Keys
@@ -320,7 +320,7 @@ class RoleControl:
         """Freeze or thaw as the one before did last, if that was not yet in a state from it: it was answered."""
         if self._switch is not None:
             verb, by = self._switch
-            Switch(verb, by, 0, 0.0).apply(self.server.axis)
+            self.server.axis.set_frozen(verb == FREEZE, by)
 
     def _leave_standby(self) -> None:
         axis, stage = self.server.axis, self.server.keys.stage

@@ -11,14 +11,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from dehyst.service.operating.server import Journal
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
-from dehyst.service.server.axis_loop import SampleSink
 from dehyst.service.storage.checkpoint import (
     CheckpointFolder,
     CheckpointMeta,
@@ -27,6 +26,9 @@ from dehyst.service.storage.checkpoint import (
     restore_newest,
 )
 from dehyst.service.storage.segments import rows_behind
+
+if TYPE_CHECKING:
+    from dehyst.service.storage.recorder import Recorder
 
 # --- Checkpoints and recordings of the other instance on the same host, from which a standby can take over.
 #
@@ -109,7 +111,7 @@ class StandbyModel:
     def __init__(
         self,
         axis: Axis,
-        sink: SampleSink | None,
+        sink: Recorder | None,
         kept: int = KEPT_SAMPLES,
         on_restored: Callable[[], None] = lambda: None,
         on_gap: Callable[[], None] = lambda: None,

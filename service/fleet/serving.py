@@ -133,8 +133,10 @@ class FleetService:
         self._fleet = load_fleet(self.settings)
         self._checkpoints = None
         self._durable = False
+        kept = self.settings.checkpoints is not None
+        verbs = dict.fromkeys((FREEZE, THAW, ROLLBACK) if kept else (FREEZE, THAW), self._apply)
         self._operations = OperationsServer(
-            self.keys, self.instance, self, Journal(self.settings.checkpoints), lambda *_: None,
+            self.keys, self.instance, verbs, Journal(self.settings.checkpoints), lambda *_: None,
             settle=lambda: self._durable, replayed=False, authenticator=self._by,
         )  # fmt: skip
         if self.settings.checkpoints is not None:
@@ -343,17 +345,9 @@ class FleetService:
         axis = fields_of(payload).get("axis")
         return to_json(self.status() if axis is None else self.axis_status(self._checked(axis, "axis")))
 
-    @property
-    def background(self) -> tuple[str, ...]:
-        """Verbs that start background work: none."""
-        return ()
-
-    def apply(self, request: Request) -> Outcome:
-        """Carry out a verb of the operator for the axes that it names; see `service.operating.verbs.Verbs`."""
+    def _apply(self, request: Request) -> Outcome:
+        """Carry out a verb of the operator for the axes that it names."""
         kept = self._checkpoints
-        verbs = (FREEZE, THAW) if kept is None else (FREEZE, THAW, ROLLBACK)
-        if request.verb not in verbs:
-            raise FieldError("verb", repr(request.verb), f"one of {', '.join(verbs)}")
         (axes,) = take(request.arguments, axes=list)
         for axis in axes:
             self._checked(axis, "arguments.axes")

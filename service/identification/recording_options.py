@@ -33,46 +33,25 @@ def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False
     group.add_argument(
         "--map", type=Path, metavar="FILE.toml", help="read these options from a file; the command line overrides it"
     )
-    group.add_argument(
-        "--column",
-        action="append",
-        default=[],
-        metavar="Q=NAME",
-        help=f"column of a quantity ({quantities}): its name or, in text and workbooks, its position from 1",
-    )
-    group.add_argument("--unit", action="append", default=[], metavar="Q=UNIT", help=f"its unit ({units})")
-    group.add_argument(
-        "--scale", action="append", default=[], metavar="Q=FACTOR", help="factor to V, µm or s in place of a unit"
-    )
-    group.add_argument(
-        "--index",
-        action="append",
-        default=[],
-        metavar="Q=:,0,2",
-        help="part of an array of several dimensions; '*' puts periods one after another: y=*,:",
-    )
-    group.add_argument(
-        "--file",
-        action="append",
-        default=[],
-        metavar="Q=FILE",
-        help="the quantity is in this file, not in the first one",
-    )
+    repeated = [
+        ("--column", "Q=NAME",
+         f"column of a quantity ({quantities}): its name or, in text and workbooks, its position from 1"),
+        ("--unit", "Q=UNIT", f"its unit ({units})"),
+        ("--scale", "Q=FACTOR", "factor to V, µm or s in place of a unit"),
+        ("--index", "Q=:,0,2",
+         "part of an array of several dimensions; '*' puts periods one after another: y=*,:"),
+        ("--file", "Q=FILE", "the quantity is in this file, not in the first one"),
+        ("--repeat", "Q",
+         "the file holds one period of this quantity, to be repeated as long as the other columns last: u"),
+    ]  # fmt: skip
     if test:
-        group.add_argument(
-            "--test-file", action="append", default=[], metavar="Q=FILE", help="the same for the recording of --test"
-        )
+        repeated.append(("--test-file", "Q=FILE", "the same for the recording of --test"))
     else:
         parser.set_defaults(test_file=[])
         if parser.get_default("test") is None:
             parser.set_defaults(test=None)
-    group.add_argument(
-        "--repeat",
-        action="append",
-        default=[],
-        metavar="Q",
-        help="the file holds one period of this quantity, to be repeated as long as the other columns last: u",
-    )
+    for option, values, text in repeated:
+        group.add_argument(option, action="append", default=[], metavar=values, help=text)
     clock = group.add_mutually_exclusive_group()
     clock.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
     clock.add_argument("--rate", type=float, metavar="HZ", help="the same as a rate, samples per second")

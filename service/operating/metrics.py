@@ -16,37 +16,73 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
 from dehyst.adaptive.errors import InputError
+from dehyst.service.operating.remote import entry
 
+#: Labels of every metric of an axis.
 _LABELS: Final = ("stage", "axis", "role", "instance")
-#: Name, kind, help, and the way to the value in a status.
-_PLAIN: Final = (
-    ("dehyst_samples_received", "counter", "samples received", ("samples", "received")),
-    ("dehyst_samples_learnt", "counter", "samples learnt from", ("samples", "learnt")),
-    ("dehyst_samples_lost", "counter", "sample numbers lost on the way", ("samples", "lost")),
-    ("dehyst_samples_thinned", "counter", "samples left out: the learner cannot keep up", ("samples", "thinned")),
-    ("dehyst_samples_dropped", "counter", "samples dropped: too many waited", ("samples", "dropped")),
-    ("dehyst_samples_malformed", "counter", "messages that could not be decoded", ("samples", "malformed")),
-    ("dehyst_samples_waiting", "gauge", "samples that wait to be learnt", ("samples", "waiting")),
-    ("dehyst_sample_age_seconds", "gauge", "age of the newest sample handled, s", ("sample_age_s",)),
-    ("dehyst_sample_rate_hertz", "gauge", "samples received per second over the last 10 s", ("rate_per_s",)),
-    ("dehyst_thinning_factor", "gauge", "one of so many stretches of samples is learnt", ("thinning",)),
+#: The values of one metric in a status, each after the values of the metric's own labels.
+_Values = Iterable[tuple[tuple[str, ...], Any]]
+
+
+def _at(*path: str) -> Callable[[dict[str, Any]], _Values]:
+    return lambda status: [((), entry(status, *path))]
+
+
+def _verdicts(status: dict[str, Any]) -> _Values:
+    gates = entry(status, "samples", "gates")
+    return [((str(verdict),), count) for verdict, count in gates.items()] if isinstance(gates, dict) else []
+
+
+def _seconds(status: dict[str, Any]) -> _Values:
+    for name, quantile in (("p50_us", "0.5"), ("p99_us", "0.99")):
+        if isinstance(value := entry(status, "queries", name), int | float):
+            yield (quantile,), 1e-6 * value
+
+
+def _troubles(status: dict[str, Any]) -> _Values:
+    name = str(status.get("trouble") or "")
+    return [((name, str(status.get("trouble_why", ""))), 1)] if name else []
+
+
+#: Name, kind, help, what gives its values, and its own labels.
+_METRICS: Final = (
+    ("dehyst_samples_received", "counter", "samples received", _at("samples", "received")),
+    ("dehyst_samples_learnt", "counter", "samples learnt from", _at("samples", "learnt")),
+    ("dehyst_samples_lost", "counter", "sample numbers lost on the way", _at("samples", "lost")),
+    ("dehyst_samples_thinned", "counter", "samples left out: the learner cannot keep up", _at("samples", "thinned")),
+    ("dehyst_samples_dropped", "counter", "samples dropped: too many waited", _at("samples", "dropped")),
+    ("dehyst_samples_malformed", "counter", "messages that could not be decoded", _at("samples", "malformed")),
+    ("dehyst_samples_waiting", "gauge", "samples that wait to be learnt", _at("samples", "waiting")),
+    ("dehyst_sample_age_seconds", "gauge", "age of the newest sample handled, s", _at("sample_age_s")),
+    ("dehyst_sample_rate_hertz", "gauge", "samples received per second over the last 10 s", _at("rate_per_s")),
+    ("dehyst_thinning_factor", "gauge", "one of so many stretches of samples is learnt", _at("thinning")),
     ("dehyst_error_percent", "gauge", "recent rms error of the model, % of the voltage span",
-     ("quality", "recent_rms_error_pct")),
-    ("dehyst_stated_deviation_volts", "gauge", "standard deviation that the model states, V", ("quality", "std_V")),
+     _at("quality", "recent_rms_error_pct")),
+    ("dehyst_stated_deviation_volts", "gauge", "standard deviation that the model states, V",
+     _at("quality", "std_V")),
     ("dehyst_within_stated_deviation_ratio", "gauge", "share of errors within one stated deviation",
-     ("quality", "share_within_std")),
-    ("dehyst_model_gain_ratio", "gauge", "gain of the stage relative to the identified one", ("quality", "gain")),
-    ("dehyst_trust_ratio", "gauge", "weight of the learning model, 0 to 1", ("trust",)),
-    ("dehyst_frozen", "gauge", "1 while an operator has stopped the learning", ("frozen",)),
-    ("dehyst_stale", "gauge", "1 while no fresh samples are known", ("stale",)),
-    ("dehyst_queries", "counter", "feedforward queries answered or refused", ("queries", "count")),
-    ("dehyst_query_errors", "counter", "feedforward queries refused", ("queries", "errors")),
-    ("dehyst_checkpoint_age_seconds", "gauge", "age of the newest checkpoint, s", ("checkpoints", "age_s")),
-    ("dehyst_checkpoint_errors", "counter", "checkpoints that could not be written", ("checkpoints", "errors")),
-    ("dehyst_recorder_written", "counter", "samples recorded", ("recorder", "written")),
-    ("dehyst_recorder_lost", "counter", "samples not recorded: the disk failed", ("recorder", "lost")),
-    ("dehyst_recorder_degraded", "gauge", "1 while recordings cannot be written", ("recorder", "degraded")),
-    ("dehyst_memory_resident_bytes", "gauge", "resident memory of the serving process", ("memory", "resident_bytes")),
+     _at("quality", "share_within_std")),
+    ("dehyst_model_gain_ratio", "gauge", "gain of the stage relative to the identified one", _at("quality", "gain")),
+    ("dehyst_trust_ratio", "gauge", "weight of the learning model, 0 to 1", _at("trust")),
+    ("dehyst_frozen", "gauge", "1 while an operator has stopped the learning", _at("frozen")),
+    ("dehyst_stale", "gauge", "1 while no fresh samples are known", _at("stale")),
+    ("dehyst_queries", "counter", "feedforward queries answered or refused", _at("queries", "count")),
+    ("dehyst_query_errors", "counter", "feedforward queries refused", _at("queries", "errors")),
+    ("dehyst_checkpoint_age_seconds", "gauge", "age of the newest checkpoint, s", _at("checkpoints", "age_s")),
+    ("dehyst_checkpoint_errors", "counter", "checkpoints that could not be written", _at("checkpoints", "errors")),
+    ("dehyst_recorder_written", "counter", "samples recorded", _at("recorder", "written")),
+    ("dehyst_recorder_lost", "counter", "samples not recorded: the disk failed", _at("recorder", "lost")),
+    ("dehyst_recorder_degraded", "gauge", "1 while recordings cannot be written", _at("recorder", "degraded")),
+    ("dehyst_memory_resident_bytes", "gauge", "resident memory of the serving process",
+     _at("memory", "resident_bytes")),
+    ("dehyst_samples_verdict", "counter", "samples by verdict", _verdicts, "verdict"),
+    ("dehyst_state", "gauge", "1 for the state that the axis is in",
+     lambda s: [((str(s.get("state", "unknown")).split(" 1/")[0],), 1)], "state"),
+    ("dehyst_healthy", "gauge", "1 while the state is ok", lambda s: [((), s.get("state") == "ok")]),
+    ("dehyst_trouble", "gauge", "1 while there is this trouble, with the reason", _troubles, "trouble", "why"),
+    ("dehyst_answering", "gauge", "1 for the model that answers by default",
+     lambda s: [((str(s["answering"]),), 1)] if s.get("answering") else [], "answering"),
+    ("dehyst_query_seconds", "gauge", "time of a query inside the service", _seconds, "quantile"),
 )  # fmt: skip
 
 
@@ -75,52 +111,15 @@ class _Collector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         yield GaugeMetricFamily("dehyst_up", "instances that answered", value=len(self._statuses))
-        for name, kind, text, path in _PLAIN:
+        for name, kind, text, read, *own in _METRICS:
             made = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
-            family = made(name, text, labels=_LABELS)
+            family = made(name, text, labels=(*_LABELS, *own))
             for status in self._statuses:
-                if (value := _number(status, path)) is not None:
-                    family.add_metric(_labels(status), value)
+                labels = [str(status.get(label, "")) for label in _LABELS]
+                for more, value in read(status):
+                    if isinstance(value, int | float):
+                        family.add_metric((*labels, *more), float(value))
             yield family
-        refused = CounterMetricFamily("dehyst_samples_verdict", "samples by verdict", labels=(*_LABELS, "verdict"))
-        state = GaugeMetricFamily("dehyst_state", "1 for the state that the axis is in", labels=(*_LABELS, "state"))
-        healthy = GaugeMetricFamily("dehyst_healthy", "1 while the state is ok", labels=_LABELS)
-        latency = GaugeMetricFamily(
-            "dehyst_query_seconds", "time of a query inside the service", labels=(*_LABELS, "quantile")
-        )
-        trouble = GaugeMetricFamily(
-            "dehyst_trouble", "1 while there is this trouble, with the reason", labels=(*_LABELS, "trouble", "why")
-        )
-        which = GaugeMetricFamily(
-            "dehyst_answering", "1 for the model that answers by default", labels=(*_LABELS, "answering")
-        )
-        for status in self._statuses:
-            labels = _labels(status)
-            if answering := status.get("answering"):
-                which.add_metric((*labels, str(answering)), 1.0)
-            if name := str(status.get("trouble") or ""):
-                trouble.add_metric((*labels, name, str(status.get("trouble_why", ""))), 1.0)
-            gates = status.get("samples", {}).get("gates", {})
-            for verdict, count in gates.items() if isinstance(gates, dict) else ():
-                refused.add_metric((*labels, str(verdict)), float(count))
-            word = str(status.get("state", "unknown"))
-            state.add_metric((*labels, word.split(" 1/")[0]), 1.0)
-            healthy.add_metric(labels, float(word == "ok"))
-            for name, quantile in (("p50_us", "0.5"), ("p99_us", "0.99")):
-                if (value := _number(status, ("queries", name))) is not None:
-                    latency.add_metric((*labels, quantile), 1e-6 * value)
-        yield from (refused, state, healthy, trouble, which, latency)
-
-
-def _labels(status: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(str(status.get(name, "")) for name in _LABELS)
-
-
-def _number(status: dict[str, Any], path: tuple[str, ...]) -> float | None:
-    value: Any = status
-    for name in path:
-        value = value.get(name) if isinstance(value, dict) else None
-    return float(value) if isinstance(value, bool | int | float) else None
 
 
 #: Longest time for reading a request, and for sending the page, s; and the most connections at a time.

@@ -144,7 +144,8 @@ _RED: Final = "\x1b[31m"
 _PLAIN: Final = "\x1b[0m"
 
 
-def _get(status: dict[str, Any], *path: str) -> Any:
+def entry(status: dict[str, Any], *path: str) -> Any:
+    """The value at ``path`` in nested objects; None where there is none."""
     value: Any = status
     for name in path:
         value = value.get(name) if isinstance(value, dict) else None
@@ -165,30 +166,20 @@ def _age(seconds: Any) -> str:
 
 
 def _state(status: dict[str, Any]) -> str:
-    """The state of the axis in a word, as the service says; of an older service the first condition that holds."""
-    if isinstance(status.get("state"), str):
-        return str(status["state"])
-    if status.get("trouble"):
-        return str(status["trouble"])
-    if status.get("stale"):
-        return "stale"
-    if status.get("frozen"):
-        return "frozen"
-    if not status.get("learning"):
-        return "not learning"
-    return "unsure" if _get(status, "quality", "valid") == 0.0 else "ok"
+    """The state of the axis in a word, as the service says."""
+    return str(status.get("state", "unknown"))
 
 
 def _gates(status: dict[str, Any]) -> str:
     """The two most frequent reasons for refused samples."""
-    gates = _get(status, "samples", "gates") or {}
+    gates = entry(status, "samples", "gates") or {}
     refused = sorted(((n, name) for name, n in gates.items() if name != "learnt"), reverse=True)
     return " ".join(f"{name}:{n}" for n, name in refused[:2]) or "-"
 
 
 def _not_handled(status: dict[str, Any]) -> int:
     """Samples that were lost on the way, dropped, or left out by thinning."""
-    return sum(_get(status, "samples", name) or 0 for name in ("lost", "dropped", "thinned"))
+    return sum(entry(status, "samples", name) or 0 for name in ("lost", "dropped", "thinned"))
 
 
 COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
@@ -197,17 +188,17 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
     ("role", 8, lambda s: str(s.get("role", "primary"))),
     ("state", 16, _state),
     ("serves", 15, lambda s: str(s.get("served"))),
-    ("err %", 7, lambda s: _number(_get(s, "quality", "recent_rms_error_pct"), ".3f")),
+    ("err %", 7, lambda s: _number(entry(s, "quality", "recent_rms_error_pct"), ".3f")),
     ("trust", 5, lambda s: _number(s.get("trust"), ".2f")),
     ("sample", 10, lambda s: str(s.get("seq"))),
     ("age", 7, lambda s: _age(s.get("sample_age_s"))),
-    ("learnt", 9, lambda s: str(_get(s, "samples", "learnt"))),
+    ("learnt", 9, lambda s: str(entry(s, "samples", "learnt"))),
     ("missed", 6, lambda s: str(_not_handled(s))),
-    ("ckpt", 7, lambda s: _age(_get(s, "checkpoints", "age_s"))),
-    ("queries", 9, lambda s: str(_get(s, "queries", "count"))),
-    ("p50 us", 7, lambda s: _number(_get(s, "queries", "p50_us"), ".0f")),
-    ("p99 us", 7, lambda s: _number(_get(s, "queries", "p99_us"), ".0f")),
-    ("MB", 5, lambda s: _number((s.get("memory") or {}).get("resident_bytes"), ".0f", 1e-6)),
+    ("ckpt", 7, lambda s: _age(entry(s, "checkpoints", "age_s"))),
+    ("queries", 9, lambda s: str(entry(s, "queries", "count"))),
+    ("p50 us", 7, lambda s: _number(entry(s, "queries", "p50_us"), ".0f")),
+    ("p99 us", 7, lambda s: _number(entry(s, "queries", "p99_us"), ".0f")),
+    ("MB", 5, lambda s: _number(entry(s, "memory", "resident_bytes"), ".0f", 1e-6)),
     ("refused", 8, lambda s: str(sum((s.get("refused") or {}).values())) if s.get("refused") else "-"),
     ("not learnt", 24, _gates),
 )

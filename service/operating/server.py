@@ -10,15 +10,15 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import zenoh
 
 from dehyst.adaptive.errors import DehystError
-from dehyst.service.operating.verbs import MAX_BYTES, Outcome, Request, decode_request
+from dehyst.service.operating.verbs import MAX_BYTES, Outcome, Request, Verb, decode_request
 from dehyst.service.protocol.container import JSON, fields_of, to_json
 from dehyst.service.protocol.errors import FieldError, ServiceError, error_to_json
 from dehyst.service.protocol.keys import Keys
@@ -39,30 +39,6 @@ _RESERVE_BYTES: Final = 65_536
 JOURNAL_BYTES: Final = 8 * 2**20
 
 
-class Switchable(Protocol):
-    """What can be frozen and thawed: an axis."""
-
-    @property
-    def frozen(self) -> bool: ...
-
-    def freeze(self, by: str = "") -> int: ...
-
-    def thaw(self, by: str = "") -> int: ...
-
-
-class Written(Protocol):
-    """When a state was copied, and by which process."""
-
-    @property
-    def samples(self) -> int: ...
-
-    @property
-    def time_unix_s(self) -> float: ...
-
-    @property
-    def instance(self) -> str: ...
-
-
 @dataclass(frozen=True, slots=True)
 class Switch:
     """A *freeze* or *thaw* in the journal.
@@ -79,21 +55,19 @@ class Switch:
     time_unix_s: float
     instance: str = ""
 
-    def is_in(self, state: Written) -> bool:
-        """Whether ``state``, of the same axis, was copied after it: then it includes it.
+    @property
+    def freezes(self) -> bool:
+        """Whether it is a *freeze*."""
+        return self.verb == FREEZE
+
+    def is_in(self, samples: int, time_unix_s: float, instance: str) -> bool:
+        """Whether a state of the same axis, copied after ``samples`` by ``instance``, was copied after it.
 
         In one process the counts of samples tell it, whatever the clock does; between two the time does.
         """
-        if self.instance and self.instance == state.instance and self.samples != state.samples:
-            return self.samples < state.samples
-        return self.time_unix_s < state.time_unix_s
-
-    def apply(self, axis: Switchable) -> None:
-        """Freeze or thaw ``axis`` unless it is so already."""
-        if self.verb == FREEZE and not axis.frozen:
-            axis.freeze(self.who)
-        elif self.verb == THAW and axis.frozen:
-            axis.thaw(self.who)
+        if self.instance and self.instance == instance and self.samples != samples:
+            return self.samples < samples
+        return self.time_unix_s < time_unix_s
 
 
 class Journal:
@@ -186,35 +160,6 @@ _WAITING: Final = 32
 _STOP: Final = None
 
 
-def answer_to(
-    request: Request, keys: Keys, instance: str, seq: int, durable: bool, standbys: int, result: Mapping[str, Any]
-) -> bytes:
-    """The reply to a command that was carried out (docs/operating.md)."""
-    answer = {
-        "schema": SCHEMA,
-        "ok": True,
-        "verb": request.verb,
-        "who": request.who,
-        "stage": keys.stage,
-        "axis": keys.axis,
-        "instance": instance,
-        "seq": seq,
-        "durable": durable,
-        "standbys": standbys,
-        "result": result,
-    }
-    return to_json(answer)
-
-
-class Commands(Protocol):
-    """What carries out the commands: the verbs of an axis, or a fleet; see `Verbs`."""
-
-    @property
-    def background(self) -> tuple[str, ...]: ...
-
-    def apply(self, request: Request) -> Outcome: ...
-
-
 class OperationsServer:
     """The queryable ``.../operate`` of one axis and the thread behind it.
 
@@ -223,11 +168,12 @@ class OperationsServer:
 
     Parameters
     ----------
-    keys, instance : of the axis. verbs : the commands. journal : keeps a record of them.
+    keys, instance : of the axis. verbs : the commands, by name. journal : keeps a record of them.
     note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
     samples : count of all samples when the last command was applied.
     tell : tells the standbys of a verb that changes the model, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
+    background : verbs that start work and do not wait for it; the others note their own events.
     replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
     authenticator : signs the answers, and tells the requests that carry the key.
     """
@@ -236,13 +182,14 @@ class OperationsServer:
         self,
         keys: Keys,
         instance: str,
-        verbs: Commands,
+        verbs: Mapping[str, Verb],
         journal: Journal,
         note: Callable[[str, str], None],
         role: Callable[[], str] = lambda: "primary",
         samples: Callable[[], int] = lambda: 0,
         tell: Callable[[str, str], int] = lambda _verb, _who: 0,
         settle: Callable[[], bool] = lambda: False,
+        background: Collection[str] = (),
         replayed: bool = True,
         authenticator: Authenticator = NO_KEY,
     ) -> None:
@@ -250,6 +197,7 @@ class OperationsServer:
         self._keys = keys
         self._instance = instance
         self._verbs = verbs
+        self._background = background
         self._journal = journal
         self._note = note
         self._role = role
@@ -306,7 +254,7 @@ class OperationsServer:
             request = decode_request(payload)
             if self._role() != "primary":
                 raise ServiceError(f"instance {self._instance} is a {self._role()}: only a primary takes commands")
-            seq, result = self._verbs.apply(request)
+            seq, result = self._apply(request)
         except Exception as error:
             self._counts["refused"] += 1
             if request is not None:
@@ -317,8 +265,33 @@ class OperationsServer:
         self._counts["done"] += 1
         journaled = self._write(request, seq=seq) and self._replayed
         standbys = self._tell(request.verb, request.who) if request.verb in _TOLD else 0
-        settled = request.verb not in self._verbs.background and self._settle()
-        return answer_to(request, self._keys, self._instance, seq, journaled or settled, standbys, result)
+        settled = request.verb not in self._background and self._settle()
+        return to_json(
+            {
+                "schema": SCHEMA,
+                "ok": True,
+                "verb": request.verb,
+                "who": request.who,
+                "stage": self._keys.stage,
+                "axis": self._keys.axis,
+                "instance": self._instance,
+                "seq": seq,
+                "durable": journaled or settled,
+                "standbys": standbys,
+                "result": result,
+            }
+        )
+
+    def _apply(self, request: Request) -> Outcome:
+        verb = self._verbs.get(request.verb)
+        if verb is None:
+            raise FieldError("verb", repr(request.verb), f"one of {', '.join(self._verbs)}")
+        try:
+            return verb(request)
+        except DehystError:
+            raise
+        except OSError as error:
+            raise ServiceError(f"{request.verb}: {error}") from error
 
     def _write(self, request: Request, seq: int | None = None, error: str = "") -> bool:
         """Write to the journal, and note an event if the verb itself does not. Whether the entry is on the disk."""
@@ -336,7 +309,7 @@ class OperationsServer:
             self._note("journal_failed", f"{self._journal.path} cannot be written; operations go on, see the status")
         if error:
             self._note("operation_refused", f"{request.who}: {request.verb[:32]}: {error}"[:300])
-        elif request.verb in self._verbs.background:
+        elif request.verb in self._background:
             self._note("operation", f"{request.who}: {request.verb} {json.dumps(dict(request.arguments))}"[:300])
         return written and self._journal.path is not None
 

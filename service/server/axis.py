@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Final, NamedTuple, Protocol
+from typing import Annotated, Any, Final, NamedTuple
 
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
@@ -33,7 +33,7 @@ from dehyst.service.answers.which_model import (
     is_identified,
     trust_by_age,
 )
-from dehyst.service.background.retuner import Retuned
+from dehyst.service.background.adoptions import Retuned
 from dehyst.service.config.settings import LEARN, AxisConfig
 from dehyst.service.intake.command_witness import CommandWitness
 from dehyst.service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
@@ -150,21 +150,6 @@ class EventLimiter:
 STAND_INS: Final = ("mpi", "linear", "bouc_wen")
 
 
-class Archive(Protocol):
-    """Where the checkpoints of an axis are kept."""
-
-    def entries(self) -> list[dict[str, Any]]:
-        """The checkpoints, newest first."""
-        ...
-
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint, whose state passes ``check``.
-
-        Raises FieldError if there is none with this number, or it does not fit.
-        """
-        ...
-
-
 class SampleCounts(NamedTuple):
     """Counts of one moment: number of the last sample handled, samples by order of arrival, samples by verdict; those
     that were refused for their number, and of these the ones that contradict what came before."""
@@ -220,8 +205,7 @@ class Axis:
     learner : learns from the samples; its snapshots are served as ``config.learn``. None for no learning.
     limits : those of ``config``, with a displacement range filled in.
     revive : starts another learner from a model, some time after a learner has failed; None: it stays failed.
-    stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
-        By default that of ``learner`` itself.
+    stage : name of the stage, for the log.
     warnings : what the operator should know from the start on, by the name of its event.
 
     Raises InputError if ``config`` names a model that is missing, or if the sample times differ.
@@ -236,7 +220,6 @@ class Axis:
         revive: Revive | None = None,
         *,
         stage: str = "",
-        archive: Archive | None = None,
         warnings: Mapping[str, str] | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
@@ -262,7 +245,6 @@ class Axis:
         self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.
         self.handled_seq = -1
-        self._archive = archive
         self._identified = {name: model for name, model in models.items() if name != AUTO}
         #: Whose its files are, see `service.storage.owner`.
         self.owner = f"{stage}/{config.name}"
@@ -407,10 +389,6 @@ class Axis:
         """Whether the learning model of the snapshot at ``seq`` has another fingerprint than ``theirs``."""
         mine = next((served for served in reversed(self._snapshots) if served.seq == seq), None)
         return bool(self.config.learn) and mine is not None and fingerprint(mine.models[self.config.learn]) != theirs
-
-    def checkpoints(self) -> list[dict[str, Any]]:
-        """The checkpoints, newest first: checkpoint, seq, samples, time_unix_s, bytes."""
-        return [] if self._archive is None else self._archive.entries()
 
     def adopt_at(self, *retuned: Retuned) -> None:
         """Let the learner adopt hyper-parameters, each right after its sample."""
@@ -585,6 +563,11 @@ class Axis:
         self.note("thawed", "learning goes on", by=by)
         return self.handled_seq
 
+    def set_frozen(self, frozen: bool, by: str) -> None:
+        """Freeze or thaw unless it is so already."""
+        if frozen != self.frozen:
+            (self.freeze if frozen else self.thaw)(by)
+
     def select(self, model: str, by: str = "") -> int:
         """Let ``model`` answer where a query names none. Raises FieldError if it is not served."""
         newest = self.newest
@@ -594,14 +577,8 @@ class Axis:
         self.note("selected", f"{model} answers instead of {newest.default}", by=by, model=model)
         return self.handled_seq
 
-    def rollback(self, checkpoint: int, by: str = "") -> int:
-        """Restore the learner of a checkpoint; numbers, memories and recording continue.
-
-        Raises FieldError if there is no such checkpoint or it does not fit.
-        """
-        if self._archive is None or self.learner is None:
-            raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
-        learner = self._archive.learner_of(checkpoint, self.learner)
+    def rollback(self, learner: OnlineModel, checkpoint: int, by: str = "") -> int:
+        """Go on with the ``learner`` of a checkpoint; numbers, memories and recording continue."""
         self.supervisor.replace(learner)
         newest = self.newest
         changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}

@@ -18,10 +18,8 @@ from dehyst.service.answers import guard
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import COMPETE, AxisConfig
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.protocol.model import digests
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.learner_supervisor import champion_of
-from dehyst.service.storage.checkpoint import CheckpointFolder
 from dehyst.service.storage.model_file import Bundle, BundleMeta, read_bundle
 
 #: Share of the identified range by which a desired point may lie beyond it where the configuration sets no limit.
@@ -87,15 +85,10 @@ def load_axis(
                 f"{config.model}: model {config.learn!r} cannot learn: {error}; identify the stage again"
             ) from error
         models |= champion_of(learner)
-    archive = None
-    if config.checkpoints is not None:
-        archive = CheckpointFolder(
-            config.checkpoints, stage, config.name, bundle.meta.dt_s, digests(bundle.models), config.checkpoints_kept
-        )
     warnings = _warnings(limits, bundle.meta)
     if config.learn and 1.0 / bundle.meta.dt_s > _CERTAIN_HZ:
         warnings |= _rate_warning(warmed, limits)
-    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive, warnings=warnings)
+    axis = Axis(config, models, learner, limits, begin, stage=stage, warnings=warnings)
     _warm_models(axis)
     return axis
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final, Protocol
-
-from numpy.typing import ArrayLike
+from typing import TYPE_CHECKING, Any, Final
 
 from dehyst.service.background.retuner import Retuner
 from dehyst.service.intake.sample_queue import Arrived, Job, SampleQueue, Thinner
@@ -20,6 +18,10 @@ from dehyst.service.intake.sequence import AHEAD
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.learner_supervisor import standing_of
+
+if TYPE_CHECKING:
+    from dehyst.service.background.watcher import Watcher
+    from dehyst.service.storage.recorder import Recorder
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"
@@ -38,56 +40,6 @@ _WINDOW_FIELDS: Final = ("window_y_um", "window_v_um_per_s", "window_u_V")
 
 #: Returns the part of a batch to handle now, or None: a standby holds samples back until it has a state.
 Gate = Callable[[SampleBatch], SampleBatch | None]
-
-
-class SampleSink(Protocol):
-    """Keeps samples: the recorder. No method blocks or raises."""
-
-    def put(self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]) -> bool:
-        """Take n samples with one verdict for all or one for each; False if they were dropped."""
-        ...
-
-    def put_aside(
-        self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]
-    ) -> bool:
-        """Take n samples that are never handled, apart from the others; False if they were dropped."""
-        ...
-
-    def rebase(self, index: int) -> None:
-        """Set the number of the next sample in the order of handling, after a state was restored."""
-        ...
-
-    def counters(self) -> dict[str, Any]:
-        """Counts for the status."""
-        ...
-
-    def close(self, timeout_s: float = ...) -> bool:
-        """Write what waits and end."""
-        ...
-
-
-class SampleWatcher(Protocol):
-    """Watches an axis for changes of the stage: the background diagnosis. No method blocks."""
-
-    def take(self, batch: SampleBatch) -> None:
-        """Samples that were handled; from the thread of the axis."""
-        ...
-
-    def tick(self, now_s: float) -> None:
-        """Start what is due; from the publishing thread."""
-        ...
-
-    def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Start a diagnosis now; from any thread."""
-        ...
-
-    def status(self) -> dict[str, Any]:
-        """For the status of the axis."""
-        ...
-
-    def close(self) -> None:
-        """End what runs."""
-        ...
 
 
 class LearnerFigures:
@@ -148,8 +100,8 @@ class AxisLoop:
         axis: Axis,
         queue: SampleQueue,
         announce: Callable[[], None],
-        sink: SampleSink | None = None,
-        watcher: SampleWatcher | None = None,
+        sink: Recorder | None = None,
+        watcher: Watcher | None = None,
         retuner: Retuner | None = None,
         on_snapshot: Callable[[], None] | None = None,
     ) -> None:

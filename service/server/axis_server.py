@@ -11,28 +11,40 @@ from typing import Any, Final
 import zenoh
 
 from dehyst.service.background.retuner import Retuner
+from dehyst.service.background.watcher import Watcher
 from dehyst.service.failover.state_transfer import tell_standbys
 from dehyst.service.intake.sample_queue import SampleQueue
 from dehyst.service.operating.server import Journal, OperationsServer
-from dehyst.service.operating.verbs import Background, Verbs
 from dehyst.service.protocol.container import to_json
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.protocol.samples import decode_samples
-from dehyst.service.security.authenticator import NO_KEY, Authenticator, HeardSamples
+from dehyst.service.protocol.samples import VERSION, decode_samples
+from dehyst.service.runtime.memory import in_use
+from dehyst.service.security.authenticator import Authenticator, HeardSamples
 from dehyst.service.security.lease import Holders
+from dehyst.service.security.refusals import refusal_counters
 from dehyst.service.server.axis import Axis
-from dehyst.service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.axis_verbs import Background, axis_verbs
 from dehyst.service.server.deltas import DeltaStreams
 from dehyst.service.server.health import Arrivals, DiskFailures, Health, SampleLosses, Staleness
 from dehyst.service.server.long_queries import LongQueries
 from dehyst.service.server.query_answers import LatencyMeter, QueryAnswers
-from dehyst.service.server.status import Publications, WriteRate, axis_status
+from dehyst.service.server.status import Publications, WriteRate, axis_fields
 from dehyst.service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
+from dehyst.service.storage.recorder import Recorder, RecorderConfig
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
+#: Version of the status.
+SCHEMA: Final = 1
+#: Warning of a service without a key.
+UNSIGNED: Final = "open: without a key nothing is signed, and everybody on the wire is believed; see docs/access.md"
+#: How long a start waits for a process that still holds a folder of its recordings or checkpoints, s.
+HOLD_S: Final = 5.0
 #: Period at which the rates of the state are taken, s.
 HEALTH_S: Final = 1.0
+#: Longest time for which an operator's command waits for the learner, s.
+_OPERATE_S: Final = 2.0
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
 #: Longest time for which it waits for the standbys to hold a freeze or thaw, s.
@@ -48,9 +60,10 @@ class AxisServer:
     Parameters
     ----------
     instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
-    sink : records samples, or None. watcher : the background diagnosis, or None.
     authenticator : signs what is sent, and checks what others of this service send.
-    long_queries : of all axes of the process; None: of this one alone.
+    long_queries : of all axes of the process.
+
+    Raises FieldError where the folder of its recordings is another's.
 
     Attributes
     ----------
@@ -67,10 +80,8 @@ class AxisServer:
         axis: Axis,
         instance: str,
         wake: Callable[[], None],
-        sink: SampleSink | None = None,
-        watcher: SampleWatcher | None = None,
-        authenticator: Authenticator = NO_KEY,
-        long_queries: LongQueries | None = None,
+        authenticator: Authenticator,
+        long_queries: LongQueries,
     ) -> None:
         self.keys = keys
         self.authenticator = authenticator
@@ -85,17 +96,22 @@ class AxisServer:
         self._operated_at = 0
         config = axis.config
         queue = SampleQueue(config.name, config.queue_samples)
+        recorder = None
+        if config.recorder is not None:
+            settings = RecorderConfig(config.recorder, axis.owner, max_bytes=config.recorder_bytes)
+            recorder = Recorder(settings, hold_s=HOLD_S)
         folder = None
         if config.checkpoints is not None:
             folder = CheckpointFolder(
                 config.checkpoints, keys.stage, keys.axis, axis.dt_s, axis.identified, config.checkpoints_kept
             )
         self.checkpoints = CheckpointKeeper(axis, queue, keys.stage, instance, folder)
+        watcher = Watcher(axis, config.diagnosis) if config.diagnosis.enabled else None
         tuned = config.retuning.enabled and axis.learner is not None
         retuner = Retuner(config.retuning, config.recorder) if tuned else None
-        self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
+        self.loop = AxisLoop(axis, queue, wake, recorder, watcher, retuner, self.checkpoints.on_snapshot)
         self._latency = LatencyMeter()
-        self._long_queries = long_queries or LongQueries()
+        self._long_queries = long_queries
         deltas = DeltaStreams(axis)
         self._answers = QueryAnswers(
             keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, authenticator, deltas
@@ -167,11 +183,6 @@ class AxisServer:
         """How many claims were ignored because they prove nothing."""
         self.claims_refused = count
 
-    def declare(self) -> None:
-        """Take samples and serve."""
-        self.listen()
-        self.serve()
-
     def undeclare(self) -> None:
         """First no longer callable; what is queued is handled and kept, then the rest ends."""
         with self._changing:
@@ -192,19 +203,19 @@ class AxisServer:
 
     # ---- operator's commands
 
-    def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
+    def _operate(self, work: Callable[[], int]) -> int:
         """Run an operator's command before the samples that wait, and copy the outcome for a checkpoint.
 
         Returns what ``work`` returns. Not from a callback of the wire, because it waits for the learner.
         """
 
         def apply() -> int:
-            seq = work(self.axis)
+            seq = work()
             self._operated_at = self.axis.sequence.received
             self.checkpoints.copy_now()
             return seq
 
-        return self.loop.queue.call(apply, timeout_s, urgent=True)
+        return self.loop.queue.call(apply, _OPERATE_S, urgent=True)
 
     def journal(self) -> Journal:
         """The operators' journal of the axis."""
@@ -219,17 +230,17 @@ class AxisServer:
             return None if self.loop.tuner is None else self.loop.tuner.request
 
         background = {"diagnose": diagnose, "retune": retune}
-        verbs = Verbs(self.axis, self.operate, background, self.checkpoints.keep_listed)
         return OperationsServer(
             self.keys,
             self.instance,
-            verbs,
+            axis_verbs(self.axis, self.checkpoints, self._operate, background),
             self.journal(),
             self.axis.note,
             lambda: self.role,
             samples=lambda: self._operated_at,
             tell=self._tell_standbys,
             settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
+            background=tuple(background),
             authenticator=self.authenticator,
         )
 
@@ -248,7 +259,7 @@ class AxisServer:
         if now_s - self._health_at_s >= HEALTH_S:
             self._health_at_s = now_s
             self._look_at_disk()
-            samples = self.status()["samples"]
+            samples = axis_fields(self.loop)["samples"]
             self._health.update(now_s, samples["received"], samples["dropped"], samples["gates"])
         with self._changing:
             self._publications.tick(now_s)
@@ -292,30 +303,42 @@ class AxisServer:
         return None if self.loop.sink is None else self.loop.sink.counters()
 
     def status(self) -> dict[str, Any]:
-        """The status as it is published."""
-        return axis_status(
-            self.keys,
-            self.instance,
-            self.loop,
-            self._latency,
-            role=self.role,
-            epoch=self.epoch,
-            synced=self.synced,
-            stale=self._staleness.stale,
-            losses=self._losses.trouble or self._disk_failures.trouble,
-            checkpoints=self.checkpoints.counters(),
-            operations=self._operations.counters(),
-            waiting_points=self._long_queries.waiting_points,
-            disk=self._disk(),
-            peers={
+        """The status as it is published; JSON values only, docs/protocol.md lists the fields. From any thread."""
+        config, signed = self.axis.config, bool(self.authenticator)
+        status = axis_fields(self.loop, self._staleness.stale, self._losses.trouble or self._disk_failures.trouble)
+        state, reason = self._health.state(status)
+        return {
+            "schema": SCHEMA,
+            "wire": VERSION,
+            "stage": self.keys.stage,
+            "axis": self.keys.axis,
+            "instance": self.instance,
+            "role": self.role,
+            "epoch": self.epoch,
+            "synced": self.synced,
+            "state": state,
+            "state_reason": reason,
+            "rate_per_s": None if self._health.per_s is None else round(self._health.per_s, 1),
+            **status,
+            "warnings": [*status["warnings"], *([] if signed else [UNSIGNED])],
+            "queries": {
+                **self._latency.summary(),
+                "max_points": config.query_points,
+                "waiting_points": self._long_queries.waiting_points,
+                "far_ahead": self.axis.far_ahead,
+            },
+            "checkpoints": self.checkpoints.counters(),
+            "operations": self._operations.counters(),
+            "peers": {
                 "claims_refused": self.claims_refused,
                 "states_refused": self._answers.states_refused,
                 "samples_refused": self._samples.refused,
             },
-            command=None if self._holders is None else self._holders.to_json(),
-            health=self._health,
-            signed=bool(self.authenticator),
-        )
+            "command": None if self._holders is None else self._holders.to_json(),
+            "disk": self._disk(),
+            "refused": refusal_counters(),
+            "memory": in_use(),
+        }
 
     def _disk(self) -> dict[str, float | None] | None:
         """What is written to the disk; None where neither samples nor checkpoints are kept."""

@@ -57,8 +57,8 @@ class Health:
         judged = passed_s >= _LEAST_S and total > 0 and good < LEAST_LEARNT * total
         self._refusal = max(refused, key=lambda name: refused[name]) if judged else ""
 
-    def state(self, status: dict[str, Any], factor: int) -> tuple[str, str]:
-        """(state, reason in words) for a status without them; ``factor`` : by which samples are thinned."""
+    def state(self, status: dict[str, Any]) -> tuple[str, str]:
+        """(state, reason in words) for a status without them."""
         if status["trouble"]:
             where = "docs/troubleshooting.md says what it means and what to do"
             lost = _lost(status) if status["trouble"] == NOT_RECORDED else ""
@@ -75,7 +75,7 @@ class Health:
             return "no samples", "none has come since the start"
         if self._dropped:
             return "dropping", f"{self._dropped} dropped in the last {WINDOW_S:g} s: too many waited; {_OUTRUN}"
-        if factor > 1:
+        if (factor := status["thinning"]) > 1:
             rate = "" if self.per_s is None else f" of {self.per_s:.0f} samples/s"
             return f"thinned 1/{factor}", f"the learner cannot keep up: it learns one stretch in {factor}{rate}"
         if self._refusal:

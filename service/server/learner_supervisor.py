@@ -46,7 +46,7 @@ from dehyst.service.answers.which_model import (
     ModelChoice,
     rule_of,
 )
-from dehyst.service.background.retuner import Adoptions, Retuned
+from dehyst.service.background.adoptions import Adoptions, Retuned
 from dehyst.service.protocol.keys import AUTO
 from dehyst.service.protocol.model import build_model, stored_kind
 

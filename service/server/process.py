@@ -24,12 +24,9 @@ from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.memory import TRIM_S, give_back, keep_little
 from dehyst.service.runtime.session import open_service
 from dehyst.service.security.authenticator import NO_KEY, Authenticator, default_key, read_key
-from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
-from dehyst.service.server.axis_loop import SampleSink, SampleWatcher
-from dehyst.service.server.axis_server import PRIMARY, STANDBY, AxisServer
+from dehyst.service.server.axis_server import HOLD_S, PRIMARY, STANDBY, UNSIGNED, AxisServer
 from dehyst.service.server.long_queries import LongQueries
-from dehyst.service.server.status import UNSIGNED
 from dehyst.service.storage.checkpoint import restore_newest
 
 _LOGGER: Final = logging.getLogger("dehyst.service")
@@ -45,32 +42,8 @@ PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
-#: How long a start waits for a process that still holds a folder of its recordings or checkpoints, s.
-_HOLD_S: Final = 5.0
 #: Longest pause of the publishing thread, s.
 _TICK_S: Final = 0.02
-
-
-def make_recorder(axis: Axis) -> SampleSink | None:
-    """The recorder of an axis, or None if the configuration names no folder.
-
-    Raises FieldError where the folder is another's.
-    """
-    config = axis.config
-    if config.recorder is None:
-        return None
-    from dehyst.service.storage.recorder import Recorder, RecorderConfig
-
-    return Recorder(RecorderConfig(config.recorder, axis.owner, max_bytes=config.recorder_bytes), hold_s=_HOLD_S)
-
-
-def make_watcher(axis: Axis) -> SampleWatcher | None:
-    """The background diagnosis of an axis, or None if the configuration switches it off."""
-    if not axis.config.diagnosis.enabled:
-        return None
-    from dehyst.service.background.watcher import Watcher
-
-    return Watcher(axis, axis.config.diagnosis)
 
 
 def authenticator_of(config: ServeConfig, standby: bool = False) -> Authenticator:
@@ -118,11 +91,11 @@ def _restore(server: AxisServer) -> None:
     A *freeze* or *thaw* that is in the operators' journal but not in the checkpoint is applied at its sample.
     """
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
-    server.checkpoints.hold(_HOLD_S)
+    server.checkpoints.hold(HOLD_S)
     switch = server.journal().last_switch()
     number = None if folder is None else restore_newest(axis, folder, axis.config.recorder, switch)
     if number is None and switch is not None:
-        switch.apply(axis)
+        axis.set_frozen(switch.freezes, switch.who)
     if sink is not None:
         sink.rebase(axis.sequence.received)
 
@@ -194,8 +167,6 @@ class Service:
                     axis,
                     self.instance,
                     self._wake.set,
-                    make_recorder(axis),
-                    make_watcher(axis),
                     authenticator,
                     self._long_queries,
                 )

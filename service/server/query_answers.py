@@ -45,17 +45,15 @@ class LatencyMeter:
         self.errors = 0
         self.busy = 0
 
-    def add(self, duration_s: float, failed: bool = False) -> None:
-        """Count one short query that took ``duration_s`` in the service, wire not included."""
-        with self._lock:
-            self._us[self._short % _KEPT] = duration_s * 1e6
-            self._short += 1
-            self.count += 1
-            self.errors += failed
+    def add(self, duration_s: float | None = None, failed: bool = False, busy: bool = False) -> None:
+        """Count one query. A short one took ``duration_s`` in the service, wire not included.
 
-    def add_long(self, failed: bool = False, busy: bool = False) -> None:
-        """Count one long query; ``busy`` : refused, because others asked for too much, which is no error."""
+        ``busy`` : refused, because others asked for too much, which is no error.
+        """
         with self._lock:
+            if duration_s is not None:
+                self._us[self._short % _KEPT] = duration_s * 1e6
+                self._short += 1
             self.count += 1
             self.errors += failed
             self.busy += busy
@@ -163,7 +161,7 @@ class QueryAnswers:
                 query.reply(key, reply, attachment=self._by.answered(query, key, reply, asked=data))
             self._latency.add(time.perf_counter() - start)
         except BusyError as error:
-            self._latency.add_long(busy=True)
+            self._latency.add(busy=True)
             self._refuse(query, error)
         except Exception as error:
             self._latency.add(time.perf_counter() - start, failed=True)
@@ -176,14 +174,14 @@ class QueryAnswers:
         key = self._keys.feedforward
 
         def refuse(error: BaseException) -> None:
-            self._latency.add_long(failed=True)
+            self._latency.add(failed=True)
             self._refuse(query, error)
 
         def send(reply: bytes) -> None:
             try:
                 with query:
                     query.reply(key, reply, attachment=self._by.answered(query, key, reply))
-                self._latency.add_long()
+                self._latency.add()
             except Exception as error:
                 refuse(error)
 

@@ -15,21 +15,14 @@ import zenoh
 from dehyst.service.protocol.container import JSON, to_json
 from dehyst.service.protocol.keys import AUTO, Keys
 from dehyst.service.protocol.model import fingerprint, stored_kind
-from dehyst.service.protocol.samples import VERSION
-from dehyst.service.runtime.memory import in_use
 from dehyst.service.runtime.session import SURELY, is_followed
 from dehyst.service.security.authenticator import NO_KEY, Authenticator
-from dehyst.service.security.refusals import refusal_counters
 from dehyst.service.server.axis_loop import AxisLoop
 from dehyst.service.server.deltas import DeltaStreams
-from dehyst.service.server.health import Health
 from dehyst.service.server.query_answers import LatencyMeter, QueryAnswers
 
 # --- The status of one axis, as JSON; docs/protocol.md lists the fields.
 
-SCHEMA: Final = 1
-#: Warning of a service without a key.
-UNSIGNED: Final = "open: without a key nothing is signed, and everybody on the wire is believed; see docs/access.md"
 #: Fields of the learner's diagnostics that a status repeats.
 _QUALITY: Final = (
     "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
@@ -37,45 +30,18 @@ _QUALITY: Final = (
 )  # fmt: skip
 
 
-def axis_status(
-    keys: Keys,
-    instance: str,
-    loop: AxisLoop,
-    latency: LatencyMeter,
-    *,
-    role: str = "primary",
-    epoch: int = 0,
-    synced: bool = True,
-    stale: bool = False,
-    losses: str = "",
-    checkpoints: dict[str, Any] | None = None,
-    operations: dict[str, int] | None = None,
-    waiting_points: int = 0,
-    peers: dict[str, int] | None = None,
-    command: dict[str, Any] | None = None,
-    disk: dict[str, float | None] | None = None,
-    health: Health | None = None,
-    signed: bool = True,
-) -> dict[str, Any]:
-    """The fields for clients, operators and viewers; JSON values only. From any thread.
+def axis_fields(loop: AxisLoop, stale: bool = False, losses: str = "") -> dict[str, Any]:
+    """What the loop of an axis tells of itself; JSON values only. From any thread.
 
-    ``losses`` : name of the way in which samples are lost, on the way here or to the disk. ``checkpoints``,
-    ``operations`` : their counters.
-    ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
-    ``command`` : who owns it, see `Holders`.
-    ``disk`` : what is written, see `WriteRate`. ``signed`` : whether answers carry an authenticator.
+    ``stale`` : whether its newest sample is too old. ``losses`` : name of the way in which samples are lost, on the way
+    here or to the disk.
     """
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
     served, counts, learn = axis.newest, axis.counts, axis.config.learn
     trouble = served.trouble or losses
     queue_dropped, thinned = queue.dropped, loop.thinner.thinned
-    status = {
-        "schema": SCHEMA,
-        "wire": VERSION,
-        "stage": keys.stage,
-        "axis": keys.axis,
-        "instance": instance,
+    return {
         "dt_s": axis.dt_s,
         "served": served.default,
         "learning": learn if axis.learning else None,
@@ -107,18 +73,8 @@ def axis_status(
         "competition": figures.standing,
         "retuning": None if loop.tuner is None else loop.tuner.status(),
         "recorder": None if loop.sink is None else loop.sink.counters(),
-        "queries": {
-            **latency.summary(),
-            "max_points": axis.config.query_points,
-            "waiting_points": waiting_points,
-            "far_ahead": axis.far_ahead,
-        },
         "diagnosis": None if loop.watcher is None else loop.watcher.status(),
-        "refused": refusal_counters(),
-        "memory": in_use(),
-        "role": role,
-        "epoch": epoch,
-        "synced": synced,
+        "thinning": loop.thinner.factor,
         "stale": stale,
         "trouble": trouble,
         "trouble_why": axis.trouble_why(trouble),
@@ -126,22 +82,8 @@ def axis_status(
         "stand_in": served.stand_in,
         "answering": axis.answering(),
         "frozen": axis.frozen,
-        "checkpoints": checkpoints,
-        "operations": operations,
-        "peers": peers,
-        "command": command,
-        "disk": disk,
         "fingerprint": fingerprint(served.models[learn]) if learn else "",
-    }
-    health = health or Health()
-    state, reason = health.state(status, loop.thinner.factor)
-    return {
-        **status,
-        "state": state,
-        "state_reason": reason,
-        "warnings": [*axis.warnings.values(), *([] if signed else [UNSIGNED])],
-        "rate_per_s": None if health.per_s is None else round(health.per_s, 1),
-        "thinning": loop.thinner.factor,
+        "warnings": list(axis.warnings.values()),
     }
 
 

@@ -456,7 +456,8 @@ def restore_newest(
             axis.note("checkpoint_refused", f"checkpoint {number}{whose}: {error}")
             continue
         axis.note("restored", f"from checkpoint {number}{whose}, sample {meta.seq}", checkpoint=number)
-        learn_again(axis, recordings, None if switch is None or switch.is_in(meta) else switch)
+        known = switch is None or switch.is_in(meta.samples, meta.time_unix_s, meta.instance)
+        learn_again(axis, recordings, None if known else switch)
         return number
     return None
 
@@ -476,13 +477,13 @@ def learn_again(axis: Axis, recordings: Path | None, switch: Switch | None = Non
     start = first
     while rows is not None and start < count:
         if start == at and switch is not None:
-            switch.apply(axis)
+            axis.set_frozen(switch.freezes, switch.who)
         stop = min(start + _PORTION, count, at if start < at else count)
         part = rows.part(start, stop)
         axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
         start = stop
     if switch is not None and at >= count:
-        switch.apply(axis)
+        axis.set_frozen(switch.freezes, switch.who)
     if rows is not None:
         axis.note("learnt_again", f"{count - first} samples from the journal")
     return count - first

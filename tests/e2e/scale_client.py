@@ -1,9 +1,7 @@
-"""The client on the lab's host: moves the stages, asks every axis all along, and at the end for what was learnt before.
+"""The client on the lab's host: moves the stages and asks every axis all along.
 
 ``python -m tests.e2e.scale_client FOLDER ROUTER`` prints one line of JSON when it has been answered by every axis, and
-another with all that it was told. The line must answer all along. Of what is learnt it keeps what each model said from
-which snapshot, and asks for the same snapshots once more, of whoever serves then: only who has learnt the same from the
-same samples gives the same voltages.
+another with all that it was told. The line must answer all along.
 """
 
 from __future__ import annotations
@@ -13,11 +11,10 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dehyst.adaptive.types import FloatArray
 from dehyst.service.client.client import Client
 from dehyst.service.operating.remote import operate, statuses
 from dehyst.service.protocol.errors import ServiceError
@@ -27,9 +24,6 @@ from dehyst.service.runtime.session import open_client
 STAGES = ("left", "right")
 AXES = ("x", "y")
 BEFORE_S, AFTER_S = 2.0, 4.0
-#: The models that learn, "" for whichever is the default; and the point that they are asked for, in µm and µm/s.
-LEARNT = ("", "lssvm_adaptive")
-ASKED = (40.0, 100.0)
 #: What the stages are sent, at their rate in Hz: voltages for so many seconds from their first sample on.
 RATE_HZ = 100
 _DRIVEN_S = 120.0
@@ -38,25 +32,13 @@ _LEARNT = 100
 _LEARNING_S = 40.0
 
 
-class Learnt(NamedTuple):
-    """When it was said, by which model, and what: voltage and deviation, V."""
-
-    at: float
-    model: str
-    u_V: float
-    std_V: float
-
-
 class Asked:
     """One axis: its client, and what it was told."""
 
     def __init__(self, router: str, stage: str, axis: str, config: Path) -> None:
         self.client = _connected(router, stage, axis, config)
-        # One memory for all questions to a model: its answers then differ by what it has learnt alone.
-        self._memories: dict[str, FloatArray] = {name: self.client.point(*ASKED, model=name).memory for name in LEARNT}
         #: When the line was asked, how long it took, what it said, and what went wrong.
         self.told: list[tuple[float, float, float | None, str]] = []
-        self._learnt: dict[tuple[str, int], Learnt] = {}
 
     def line(self) -> None:
         """Ask the line, which always says the same."""
@@ -67,27 +49,6 @@ class Asked:
         except ServiceError as error:
             failure = type(error).__name__
         self.told.append((at, time.monotonic() - at, u_V, failure))
-
-    def learnt(self) -> None:
-        """Keep one answer a snapshot of each model that learns; what gets none is asked again soon."""
-        for name in LEARNT:
-            at = time.monotonic()
-            with contextlib.suppress(ServiceError):
-                point = self.client.point(*ASKED, model=name, memory=self._memories[name])
-                if point.snapshot_seq >= 0:
-                    kept = Learnt(at, point.model, point.u_V, point.std_V)
-                    self._learnt.setdefault((name, point.snapshot_seq), kept)
-
-    def once_more(self) -> list[dict[str, Any]]:
-        """The same questions to the same snapshots as they are held now; None where one is no longer held."""
-        rows = []
-        for (name, seq), then in self._learnt.items():
-            now: list[Any] | None = None
-            with contextlib.suppress(ServiceError):
-                point = self.client.point(*ASKED, model=name, memory=self._memories[name], as_of=seq)
-                now = [point.model, point.u_V, point.std_V] if point.snapshot_seq == seq else None
-            rows.append({"asked": name, "seq": seq, "at": then.at, "then": list(then[1:]), "now": now})
-        return rows
 
 
 def drive(folder: Path, router: str) -> None:
@@ -128,9 +89,6 @@ def ask(folder: Path, router: str) -> int:
         time.sleep(max(0.0, start + k / 20 - time.monotonic()))
         for asked in axes.values():
             asked.line()
-            if k % 4 == 0:
-                asked.learnt()
-    learnt = {name: asked.once_more() for name, asked in axes.items()}
     for asked in axes.values():
         asked.client.close()
     with open_client(router, zenoh_config=config) as session:
@@ -138,7 +96,7 @@ def ask(folder: Path, router: str) -> int:
     with open_client(router, zenoh_config=folder / "alice.json5") as session:
         done = operate(session, Keys("left", "x"), "freeze", "alice")
     told = {name: asked.told for name, asked in axes.items()}
-    print(json.dumps({"asked": told, "learnt": learnt, "before": before, "after": after, "operated": done}), flush=True)
+    print(json.dumps({"asked": told, "before": before, "after": after, "operated": done}), flush=True)
     return 0
 
 

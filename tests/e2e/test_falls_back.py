@@ -36,8 +36,8 @@ pytestmark = [pytest.mark.e2e, pytest.mark.slow, pytest.mark.alone]
 DT_S = 1e-3
 SERVED, BASELINE = "lssvm_adaptive", "linear"
 U_MIN_V, U_MAX_V, SLEW_V_PER_S = -2.0, 10.0, 4000.0
-#: How long a fault lasts: the last good model is served for two seconds, the baseline takes over within another.
-FAULT_S = 4.0
+#: How long a fault lasts: the last good model is served for a second, the baseline takes over within another.
+FAULT_S = 3.0
 #: How long the service may take to come back once the fault is over.
 BACK_S = 15.0
 WANTED_UM = 40.0 + 2.0 * np.sin(2 * np.pi * 5.0 * DT_S * np.arange(20))
@@ -83,7 +83,7 @@ class World:
             f'stage = "demo"\nlisten = ["{self.endpoint}"]\nlease_s = 10.0\n'
             f'[[axis]]\nname = "x"\nmodel = {json.dumps(str(model))}\n'
             f"u_min_V = {U_MIN_V}\nu_max_V = {U_MAX_V}\nslew_V_per_s = {SLEW_V_PER_S}\n"
-            f'served = "{SERVED}"\nstale_s = 0.3\nlast_good_s = 2.0\n'
+            f'served = "{SERVED}"\nstale_s = 0.3\nlast_good_s = 1.0\n'
         )
         self.events: list[str] = []
         self.processes = [Process("serve", "--config", str(config), path=folder / "path")]

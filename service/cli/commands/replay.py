@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
     from dehyst.adaptive.inverse_model import LssvmInverse
-    from dehyst.service.background.retuner import read_adoptions
+    from dehyst.service.background.adoptions import read_adoptions
     from dehyst.service.config.learner import read_learner_settings
     from dehyst.service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from dehyst.service.server.axis_loading import load_axis

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.types import Feedforward, FloatArray, InverseModel
+from dehyst.adaptive.types import Feedforward, FloatArray
 from dehyst.service.answers.fallback import Rules, answer_safely
 from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
 from dehyst.service.answers.which_model import domain_weight, trust_by_age
@@ -279,10 +279,6 @@ def test_a_snapshot_in_another_process_answers_to_the_same_bit_outside_the_domai
     assert (
         not axis.answer(FeedforwardQuery(y, v, np.zeros(60), model="linear")).flags.astype(int).tolist().count(BLENDED)
     )
-
-
-def test_inverse_models_are_what_the_tests_take_them_for() -> None:
-    assert isinstance(Says((1.0,)), InverseModel)
 
 
 # --- Whatever a model answers, what leaves is finite, within the limits and within the slew.

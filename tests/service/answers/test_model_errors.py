@@ -13,7 +13,6 @@ from dehyst.service.answers import which_model
 from dehyst.service.answers.fallback import Rules, answer_safely
 from dehyst.service.answers.guard import Limits
 from dehyst.service.answers.which_model import voltages_along
-from tests.service.conftest import make_models
 
 
 @pytest.fixture
@@ -44,13 +43,3 @@ def test_the_words_of_a_models_error_are_logged_once(broken: Any, caplog: pytest
     (record,) = caplog.records
     assert "Broken raised ZeroDivisionError: the width is zero" in record.getMessage()
     assert record.exc_info is not None
-
-
-def test_another_error_is_logged_too_and_a_sound_model_logs_nothing(
-    broken: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.ERROR, "dehyst.model"):
-        which_model.log_model_error(broken, ValueError("one"))
-        which_model.log_model_error(broken, TypeError("other"))
-        voltages_along(make_models()["linear"], np.linspace(0.0, 1.0, 3))
-    assert len(caplog.records) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -59,11 +58,9 @@ def test_the_page_is_up_to_date() -> None:
     assert committed == page(), "run: python -m dehyst.service.answers.which_model > docs/which_model.md"
 
 
-@pytest.mark.parametrize(("before", "after"), list(itertools.product(SITUATIONS, repeat=2)))
-def test_a_state_is_left_for_another_as_soon_as_that_is_what_is_seen(before: Answering, after: Answering) -> None:
-    """From each state to each: the word depends on nothing but what is seen."""
+def test_the_first_row_that_holds_says_which_model_answers() -> None:
     assert set(SITUATIONS) == set(Answering) == set(MODELS) == {row.answers for row in ROWS}
-    assert [answering(SITUATIONS[one]) for one in (before, after)] == [before, after]
+    assert {answers: answering(seen) for answers, seen in SITUATIONS.items()} == {one: one for one in Answering}
 
 
 @pytest.mark.parametrize(
@@ -168,7 +165,7 @@ def test_each_trouble_serves_the_model_of_its_rule(trouble: str) -> None:
     assert life.choice.rule == rule_of("")
 
 
-@pytest.mark.parametrize("trouble", sorted(RULES.keys() - {""}))
+@pytest.mark.parametrize("trouble", ["sensor_stuck", "nothing_learnt", "learner_failed"])
 def test_a_trouble_that_lasts_takes_the_trust_and_its_end_gives_it_back(trouble: str) -> None:
     life = Life()
     life.go(100)

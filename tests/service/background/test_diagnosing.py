@@ -36,19 +36,12 @@ from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 from tests.online_models import PlainModel
 from tests.service.background.test_diagnosing_parts import DT_S, batch
+from tests.service.living import eventually
 
 #: The jobs run at the lowest priority: beside other work they would not be done in time.
 pytestmark = pytest.mark.alone
 
 QUICK = WatchConfig(history_s=8.0, reference_s=4.0, recent_s=3.0, collect_s=2.0, cooldown_s=5.0, timeout_s=60.0)
-
-
-def eventually(condition: Callable[[], Any], within_s: float) -> Any:
-    until = time.monotonic() + within_s
-    while not (value := condition()):
-        assert time.monotonic() < until, "did not come true in time"
-        time.sleep(0.05)
-    return value
 
 
 # ---- jobs and the watcher, on the stage that stands in for hardware
@@ -285,16 +278,6 @@ def test_a_stage_that_rests_gives_no_reference(model_file: Path) -> None:
         watcher.take(batch(first, 100, y_um=40.0))
     assert not watcher.status()["reference"]
     assert not watcher.request({})["started"]
-
-
-def test_watching_brings_neither_torch_nor_plots_into_the_service() -> None:
-    code = (
-        "import sys, dehyst.service.server.process, dehyst.service.background.watcher\n"
-        "heavy = ('torch', 'matplotlib', 'rerun', 'dehyst.sim.diagnosis', 'dehyst.sim.changes')\n"
-        "print([m for m in heavy if m in sys.modules])"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert ended.stdout.strip() == "[]"
 
 
 @pytest.mark.e2e

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import weakref
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.types import FloatArray, Hyperparameters, WindowData
 from dehyst.service.answers.guard import Limits
 from dehyst.service.background.retuner import Retuner
-from dehyst.service.background.retuning_worker import pack, start_job, tuned
+from dehyst.service.background.retuning_worker import _search, pack, start_job, tuned
 from dehyst.service.background.settings import RetuningConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.samples import SampleBatch
@@ -105,6 +106,11 @@ def test_torch_gives_the_starts_where_it_is_wanted_and_installed() -> None:
     assert with_torch["J2"] < with_torch["J2_before"] - 30.0
     # Where both find the same basin they agree; torch's starts lead to none that is worse.
     assert with_torch["J2"] <= without["J2"] + 0.1
+
+
+def test_without_torch_the_starts_are_around_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert "torch is not installed" in _search(True)[1]
 
 
 # ---- the thread that learns

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 from dehyst.service.storage.model_file import Bundle, BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
+from tests.service.living import eventually
 
 DT_S, AXES = 1e-3, 64
 GAINS = 1.0 + 0.002 * np.arange(AXES)
@@ -99,14 +100,6 @@ def ask(session: zenoh.Session, key: str, payload: bytes = b"") -> Any:
 def status(session: zenoh.Session, **of: int) -> dict[str, Any]:
     said: dict[str, Any] = json.loads(ask(session, KEYS.status, json.dumps(of).encode() if of else b""))
     return said
-
-
-def eventually(condition: Callable[[], Any]) -> Any:
-    until = time.monotonic() + 30.0
-    while not (value := condition()):
-        assert time.monotonic() < until, "did not come true in time"
-        time.sleep(0.05)
-    return value
 
 
 def follow_one_axis(session: zenoh.Session) -> None:
@@ -455,14 +448,6 @@ def test_a_configuration_names_what_does_not_fit(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             parse_config(text, "f", tmp_path)
-
-
-def test_a_service_without_a_fleet_imports_neither_torch_nor_fleet() -> None:
-    code = (
-        "import sys, dehyst.service.server.process, dehyst.service.cli.commands.serve, dehyst.service.config.settings\n"
-        "sys.exit(bool({'torch', 'dehyst.adaptive.fleet.fleet', 'dehyst.service.fleet.serving'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
 
 
 def test_without_torch_the_extra_is_named(tmp_path: Path) -> None:

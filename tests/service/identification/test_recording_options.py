@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,6 @@ from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import main
 from dehyst.service.identification.recording_options import add_mapping_arguments, load, mapping_from
 
-ROOT = Path(__file__).resolve().parents[3]
 N, PERIODS, DT_S = 400, 4, 0.002
 T = np.arange(N) * DT_S
 U = 4.0 - 4.0 * np.cos(2 * np.pi * 2.5 * T)
@@ -107,35 +104,26 @@ def test_identify_reads_a_table_without_names_and_judges_on_a_tdms_file(
     assert out.exists()
 
 
-def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "dehyst.lab.cli", *arguments],
-        cwd=cwd,
-        env={"PYTHONPATH": f"{ROOT}:{':'.join(path for path in sys.path if path)}", "PATH": "", "HOME": str(cwd)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-
-
-def test_the_real_command_line_reads_two_files_and_refuses_without_writing(rig: Path) -> None:
+def test_the_commands_read_two_files_and_refuse_without_writing(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(rig)
     read = ("drive_V.npy", "--file", "y=sensor.npy", "--unit", "y=um", "--dt-s", str(DT_S))
     periods = ("--index", "y=*,:", "--repeat", "u")
     models = ("--models", "linear,lssvm_adaptive", "--support", "50", "--no-pictures")
-    done = command("identify", *read, *periods, *models, "--out", "m.npz", cwd=rig)
-    assert done.returncode == 0, done.stderr
-    assert f"drive_V.npy: {N * PERIODS} samples" in done.stderr
-    assert "y: 4 periods of 400 samples put one after another" in done.stderr
-    assert "u: its 400 samples are one period and are repeated 4 times" in done.stderr
+    assert main(["identify", *read, *periods, *models, "--out", "m.npz"]) == 0
+    said = capsys.readouterr().err
+    assert f"drive_V.npy: {N * PERIODS} samples" in said
+    assert "y: 4 periods of 400 samples put one after another" in said
+    assert "u: its 400 samples are one period and are repeated 4 times" in said
     (rig / "learner.toml").write_text("window = 200\n")
     before = sorted(path.name for path in rig.iterdir())
     for arguments, message in (
         (("diagnose", *read, *periods[:2], "--out", "report"), "add --repeat u"),
         (("replay", *read, *periods[2:], "--config", "learner.toml", "--model", "m.npz", "--out", "played"), "y=*,:"),
     ):
-        done = command(*arguments, cwd=rig)
-        assert done.returncode == 2, done.stderr
-        assert done.stderr.startswith(f"dehyst {arguments[0]}: ")
-        assert message in done.stderr
+        assert main(arguments) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"dehyst {arguments[0]}: ")
+        assert message in said
     assert sorted(path.name for path in rig.iterdir()) == before

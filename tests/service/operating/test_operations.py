@@ -13,34 +13,28 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy import arange, pi, sin
 
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
 from dehyst.service.operating.remote import operate, screen, statuses, table
 from dehyst.service.operating.server import RESERVE, Journal, OperationsServer, Switch
-from dehyst.service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
-from dehyst.service.protocol import samples as wire
+from dehyst.service.operating.verbs import MAX_BYTES, Request, decode_request, encode_request
 from dehyst.service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import open_client, open_service
 from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_authenticator
-from tests.service.living import eventually
+from dehyst.service.server.axis_verbs import axis_verbs
+from tests.service.living import eventually, samples
 
 KEYS = Keys("demo", "x")
-
-
-def samples(first: int, n: int) -> bytes:
-    k = arange(first, first + n)
-    y = 45.0 + 30.0 * sin(2 * pi * 3.0 * k * 1e-3)
-    return wire.encode_samples(k, k * 1e-3, (y - 1.0) / (11.0 * 0.95), y)
 
 
 class FakeAxis:
@@ -48,6 +42,7 @@ class FakeAxis:
 
     def __init__(self) -> None:
         self.handled_seq = 41
+        self.learner = object()
         self.done: list[tuple[Any, ...]] = []
         self.hold = threading.Event()
         self.hold.set()
@@ -67,27 +62,32 @@ class FakeAxis:
         self.done.append(("select", model, by))
         return self.handled_seq
 
-    def rollback(self, checkpoint: int, by: str = "") -> int:
-        if checkpoint == 666:
-            raise RuntimeError("something within")
+    def rollback(self, learner: object, checkpoint: int, by: str = "") -> int:
         self.done.append(("rollback", checkpoint, by))
         return self.handled_seq
 
-    def checkpoints(self) -> list[dict[str, Any]]:
+
+class FakeFolder:
+    """One checkpoint, with the number 3."""
+
+    def entries(self) -> list[dict[str, Any]]:
         return [{"checkpoint": 3, "seq": 30, "samples": 20, "time_unix_s": 1.0, "bytes": 999}]
+
+    def learner_of(self, number: int, like: object) -> object:
+        if number == 666:
+            raise RuntimeError("something within")
+        return like
 
 
 def make(axis: FakeAxis, folder: Path | None, role: str = "primary") -> tuple[OperationsServer, list[tuple[str, str]]]:
     events: list[tuple[str, str]] = []
-    verbs = Verbs(
-        axis,
-        lambda work: work(axis),
-        {"retune": lambda: lambda arguments: {"started": True, "job": 3}, "diagnose": lambda: None},
-    )
+    background = {"retune": lambda: lambda arguments: {"started": True, "job": 3}, "diagnose": lambda: None}
+    checkpoints = SimpleNamespace(folder=FakeFolder(), keep_listed=lambda: frozenset({3}))
+    verbs = axis_verbs(axis, checkpoints, lambda work: work(), background)  # type: ignore[arg-type]
     journal = Journal(folder, wall_s=lambda: 1234.5)
     return OperationsServer(
         KEYS, "i1-00", verbs, journal, lambda name, detail: events.append((name, detail)), lambda: role,
-        authenticator=own_authenticator(),
+        background=tuple(background), authenticator=own_authenticator(),
     ), events  # fmt: skip
 
 
@@ -292,32 +292,7 @@ def test_who_only_says_that_a_command_is_done_is_not_believed(
     liar.undeclare()  # type: ignore[no-untyped-call]
 
 
-def test_more_than_can_wait_is_refused_at_once(
-    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer], tmp_path: Path
-) -> None:
-    axis, client, server = wire_axis
-    operate(client, KEYS, "thaw", "warm")
-    axis.hold.clear()
-    waiting = [request(client, ask("freeze", f"a{i}")) for i in range(40)]
-    time.sleep(0.2)
-    axis.hold.set()
-    replies = [reply for handler in waiting for reply in handler]
-    refused = [json.loads(reply.err.payload.to_bytes()) for reply in replies if reply.err is not None]
-    assert len(replies) == 40
-    # 32 wait, and one is being done if it was taken before the last of them came.
-    assert 40 - 33 <= len(refused) <= 40 - 32
-    assert all("wait already" in error["message"] for error in refused)
-
-    def journaled() -> list[dict[str, Any]]:
-        return [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
-
-    eventually(lambda: len(journaled()) == 41, 10.0)
-    assert sum("wait already" in line.get("error", "") and not line["ok"] for line in journaled()) == len(refused)
-    assert len({line["who"] for line in journaled()}) == 41
-    assert server.counters()["unlogged"] == 0
-
-
-def test_a_flood_of_refused_requests_is_journaled_as_a_number(
+def test_more_than_can_wait_is_refused_at_once_and_a_flood_is_journaled_as_a_number(
     wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer], tmp_path: Path
 ) -> None:
     axis, client, server = wire_axis
@@ -326,7 +301,13 @@ def test_a_flood_of_refused_requests_is_journaled_as_a_number(
     waiting = [request(client, ask("freeze", f"a{i}")) for i in range(200)]
     eventually(lambda: server.counters()["refused"] >= 200 - 33)
     axis.hold.set()
-    refused = sum(reply.err is not None for handler in waiting for reply in handler)
+    replies = [reply for handler in waiting for reply in handler]
+    errors = [json.loads(reply.err.payload.to_bytes()) for reply in replies if reply.err is not None]
+    refused = len(errors)
+    # 32 wait, and one is being done if it was taken before the last of them came.
+    assert 200 - 33 <= refused <= 200 - 32
+    assert len(replies) == 200
+    assert all("wait already" in error["message"] for error in errors)
 
     def told() -> int:
         lines = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
@@ -369,8 +350,7 @@ def test_an_answer_says_whether_it_outlives_a_crash(tmp_path: Path) -> None:
         server, _ = make(FakeAxis(), folder)
         assert json.loads(server.handle(ask("freeze")))["durable"] is durable
     settled = OperationsServer(
-        KEYS, "i1-00", Verbs(FakeAxis(), lambda work: work(FakeAxis()), {}), Journal(None), lambda *_: None,
-        settle=lambda: True,
+        KEYS, "i1-00", {"freeze": lambda request: (41, {})}, Journal(None), lambda *_: None, settle=lambda: True
     )  # fmt: skip
     assert json.loads(settled.handle(ask("freeze")))["durable"] is True
 
@@ -394,30 +374,25 @@ def test_the_last_switch_is_read_from_a_damaged_journal(tmp_path: Path) -> None:
     assert journal.last_switch() == Switch("thaw", "bob", 90, 5.0)
 
 
-@dataclass(frozen=True)
-class State:
-    samples: int
-    time_unix_s: float
-    instance: str = "i1-a"
-
-
 @pytest.mark.parametrize(
-    ("state", "included"),
+    ("samples", "time_unix_s", "instance", "included"),
     [
-        (State(499, 9999.0), False),  # the clock went back between the two
-        (State(501, 1.0), True),
-        (State(500, 999.0), False),
-        (State(500, 1001.0), True),
-        (State(10, 1001.0, "i2-b"), True),  # the process after it counts anew
-        (State(10_000, 999.0, "i2-b"), False),
+        (499, 9999.0, "i1-a", False),  # the clock went back between the two
+        (501, 1.0, "i1-a", True),
+        (500, 999.0, "i1-a", False),
+        (500, 1001.0, "i1-a", True),
+        (10, 1001.0, "i2-b", True),  # the process after it counts anew
+        (10_000, 999.0, "i2-b", False),
     ],
 )
-def test_a_state_includes_a_switch_whatever_the_clock_does(state: State, included: bool) -> None:
-    assert Switch("freeze", "alice", 500, 1000.0, "i1-a").is_in(state) is included
+def test_a_state_includes_a_switch_whatever_the_clock_does(
+    samples: int, time_unix_s: float, instance: str, included: bool
+) -> None:
+    assert Switch("freeze", "alice", 500, 1000.0, "i1-a").is_in(samples, time_unix_s, instance) is included
 
 
 STATUS: dict[str, Any] = {
-    "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "served": "lssvm_adaptive",
+    "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "state": "ok", "served": "lssvm_adaptive",
     "learning": "lssvm_adaptive", "seq": 12345, "sample_age_s": 0.01, "refused": {"messages": 3},
     "samples": {"learnt": 9000, "lost": 2, "dropped": 0, "gates": {"learnt": 9000, "saturated": 70, "late": 5}},
     "queries": {"count": 88, "errors": 1, "p50_us": 101.4, "p99_us": 240.0},
@@ -425,7 +400,7 @@ STATUS: dict[str, Any] = {
 
 
 def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing() -> None:
-    frozen = {**STATUS, "axis": "y", "frozen": True, "role": "standby"}
+    frozen = {**STATUS, "axis": "y", "state": "frozen", "role": "standby"}
     lines = table([STATUS, frozen, {"stage": "a", "axis": "b", "instance": "c"}]).splitlines()
     assert len(lines) == 4
     for word in ("demo/x", "i1-ab", "primary", "ok", "lssvm_adaptive", "12345", "9000", "101", "240", "saturated:70"):

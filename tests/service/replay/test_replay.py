@@ -146,10 +146,10 @@ def test_what_was_filled_in_is_not_scored(replayed: Replayed) -> None:
     assert replayed.repaired
 
 
-def test_nothing_is_foretold_from_what_comes_later(model_file: Path, samples: Recording) -> None:
+def test_nothing_is_foretold_from_what_comes_later(model_file: Path, samples: Recording, replayed: Replayed) -> None:
     """Other voltages from 4 s on change no error before: what is foretold has not seen them."""
     other = replace(samples, u_V=np.where(samples.t_s < 4.0, samples.u_V, samples.u_V[::-1]))
-    one, two = replay(samples, axis_of(model_file)), replay(other, axis_of(model_file))
+    one, two = replayed, replay(other, axis_of(model_file))
     before = one.t_s < 4.0
     assert np.array_equal(one.adaptive_V[before], two.adaptive_V[before], equal_nan=True)
     assert not np.array_equal(one.adaptive_V[~before], two.adaptive_V[~before], equal_nan=True)
@@ -330,14 +330,16 @@ def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert len(decisions(tmp_path / "out" / "gates.csv")) == printed["samples"]
 
 
-@pytest.mark.parametrize("missing", [3, 30, 60])
-def test_a_short_gap_costs_nothing_soon_after_it(model_file: Path, samples: Recording, missing: int) -> None:
+@pytest.mark.parametrize("missing", [3, 60])
+def test_a_short_gap_costs_nothing_soon_after_it(
+    model_file: Path, samples: Recording, replayed: Replayed, missing: int
+) -> None:
     """60 missing samples used to raise the error for the rest of the recording."""
     keep = np.ones(len(samples), dtype=np.bool_)
     keep[4000 : 4000 + missing] = False
     seq = sequence(samples)
     cut = Recording(samples.t_s[keep], samples.u_V[keep], samples.y_um[keep], DT_S, source="gap", seq=seq[keep])
-    whole, gapped = replay(samples, axis_of(model_file)), replay(cut, axis_of(model_file))
+    whole, gapped = replayed, replay(cut, axis_of(model_file))
     assert gapped.t_s.size == whole.t_s.size
     assert np.isnan(gapped.adaptive_V[4003 : 4000 + missing]).all()
     # A gap that is bridged costs nothing. After a longer one the memory is found within a second.
@@ -348,8 +350,7 @@ def test_a_short_gap_costs_nothing_soon_after_it(model_file: Path, samples: Reco
     assert np.isfinite(gapped.adaptive_V[:4000]).sum() > 3900
 
 
-@pytest.mark.parametrize("missing", [500, 1000])
-def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path, missing: int) -> None:
+def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path) -> None:
     """The replay used to go on along a straight line for good, wherever the stage had turned meanwhile."""
     stage = Stage(preset("rich", seed=4))
     u_V = multitone(8.0, DT_S, seed=4)[1]
@@ -357,7 +358,7 @@ def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path, missing: 
     y_um, _ = stage.run(stage.initial_state(), u_V)
     t_s = np.arange(u_V.size) * DT_S
     keep = np.ones(u_V.size, dtype=np.bool_)
-    first = 4130 + missing
+    first = 5130
     keep[4130:first] = False
     whole = replay(Recording(t_s, u_V, y_um, DT_S, source="whole"), axis_of(model_file))
     cut = Recording(t_s[keep], u_V[keep], y_um[keep], DT_S, source="gap", seq=np.flatnonzero(keep))

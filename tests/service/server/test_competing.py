@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,23 +17,22 @@ from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.types import FloatArray, Hyperparameters, InverseModel
 from dehyst.baselines import fit_linear, fit_mpi
 from dehyst.service.answers.guard import Limits
-from dehyst.service.background.retuner import (
+from dehyst.service.background.adoptions import (
     ADOPTIONS_FILE,
     Adoptions,
     Retuned,
-    Retuner,
     append_adoption,
     read_adoptions,
 )
+from dehyst.service.background.retuner import Retuner
 from dehyst.service.background.retuning_worker import start_job
 from dehyst.service.background.settings import RetuningConfig
-from dehyst.service.config.settings import AxisConfig, parse_config
+from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.query import FeedforwardQuery
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
-from dehyst.service.server.learner_supervisor import champion_of
 from dehyst.service.storage.model_file import Bundle, BundleMeta
 from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.presets import preset
@@ -396,23 +393,6 @@ def test_a_frozen_learner_is_left_alone(
         retuner.request({"hurry": True})
 
 
-def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> None:
-    code = (
-        "import sys\n"
-        "class Blocked:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
-        "sys.meta_path.insert(0, Blocked())\n"
-        "import dehyst.service.server.axis_server, dehyst.service.server.axis_loading\n"
-        "import dehyst.service.background.retuner\n"
-        "from dehyst.service.background.retuning_worker import _search\n"
-        "assert 'dehyst.baselines.swarm.evidence_search' not in sys.modules\n"
-        "print(_search(True)[1])"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
-    assert "torch is not installed" in run.stdout
-
-
 @pytest.mark.alone
 def test_a_worker_that_dies_says_why() -> None:
     job = start_job({"kind": "nonsense"}, {}, 60.0)
@@ -449,18 +429,3 @@ def test_adoptions_are_made_once_in_order_at_their_sample(bundle: Bundle, tmp_pa
     (tmp_path / ADOPTIONS_FILE).write_text('{"seq": 1, "gamma": -1, "widths": [1]}\n')
     with pytest.raises(InputError, match="gamma"):
         read_adoptions(tmp_path)
-
-
-def test_settings_come_from_the_configuration(tmp_path: Path) -> None:
-    text = (
-        'stage = "demo"\n[[axis]]\nname = "x"\nmodel = "x.npz"\nu_min_V = 0.0\nu_max_V = 1.0\nslew_V_per_s = 1.0\n'
-        'compete = ["mpi"]\n[axis.competition]\nmargin = 1.5\n[axis.retuning]\nperiod_s = 5\n'
-        "[axis.retuning.search]\nstarts = 2\n"
-    )
-    axis = parse_config(text, "serve.toml", tmp_path).axes[0]
-    assert (axis.compete, axis.competition.margin, axis.retuning.period_s) == (("mpi",), 1.5, 5.0)
-    assert axis.retuning.search == RetuneConfig(starts=2)
-    for bad in ("margin = 1.5\n", 'compete = ["mpi"]'):
-        with pytest.raises(InputError):
-            parse_config(text.replace(bad, bad.replace("1.5", "0.5").replace('"mpi"', "3")), "serve.toml", tmp_path)
-    assert champion_of(None) == {}

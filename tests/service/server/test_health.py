@@ -15,13 +15,11 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sample_queue import Arrived
-from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
 from dehyst.service.server.health import Health, Staleness
-from dehyst.service.server.query_answers import LatencyMeter
-from dehyst.service.server.status import axis_status
+from dehyst.service.server.status import axis_fields
 from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.service.axes import loop_of
 
@@ -40,18 +38,14 @@ def axis_loop(models: dict[str, InverseModel]) -> Make:
     return make
 
 
-def status_of(loop: AxisLoop, health: Health | None = None) -> dict[str, Any]:
-    return axis_status(Keys("demo", "x"), "i1", loop, LatencyMeter(), health=health)
-
-
 META = BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0, u_min_V=0.0, u_max_V=8.0)
 
 
 def test_limits_narrower_than_the_model_and_a_clipped_recording_are_warned_of_at_the_start(axis_loop: Make) -> None:
-    assert status_of(axis_loop(META))["warnings"] == []
+    assert axis_fields(axis_loop(META))["warnings"] == []
     wide = replace(META, u_min_V=5.0, u_max_V=120.0, notes={"clipped": ["y_um: flat top at 90"]})
     loop = axis_loop(wide)
-    narrow, clipped = status_of(loop)["warnings"]
+    narrow, clipped = axis_fields(loop)["warnings"]
     assert "limits of 0 to 9 V are narrower than the 5 to 120 V" in narrow
     assert "flat top at 90" in clipped
     assert [event["event"] for event in loop.axis.take_events()] == ["limits_narrow", "model_clipped"]
@@ -97,7 +91,7 @@ def test_received_is_what_was_learnt_refused_thinned_and_dropped(
     sent += k.size
     loop.start()
     loop.close()
-    samples = status_of(loop)["samples"]
+    samples = axis_fields(loop)["samples"]
     assert samples["received"] == sent
     assert samples["thinned"] > 0
     assert samples["dropped"] > 0
@@ -122,7 +116,7 @@ def test_numbers_handled_add_up_at_every_moment_while_samples_are_left_out(
         loop.offer(SampleBatch(part, part * DT_S, (y_um - 1.0) / 11.0, y_um))
         if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
             loop.take(item)
-        status = status_of(loop)
+        status = axis_fields(loop)
         s = status["samples"]
         handled = s["received"] - s["thinned"] - s["dropped"]
         assert status["seq"] + 1 == handled - s["late"] + s["lost"] + s["left_out"]
@@ -149,11 +143,12 @@ def test_the_status_says_why_there_is_a_trouble_until_it_is_over(axis_loop: Make
     axis.note("trouble", "out_of_envelope (gain 1.6 of the identified): widen learner.envelope.gain")
 
     def said(losses: str) -> dict[str, Any]:
-        return axis_status(Keys("demo", "x"), "i-1", loop, LatencyMeter(), losses=losses)
+        return axis_fields(loop, losses=losses)
 
     assert said("samples_lost")["trouble_why"] == "samples_lost (95 of 100 numbers are missing)"
-    assert said("out_of_envelope")["state"] == "out_of_envelope"
-    assert "widen learner.envelope.gain" in said("out_of_envelope")["state_reason"]
+    state, reason = Health().state(said("out_of_envelope"))
+    assert state == "out_of_envelope"
+    assert "widen learner.envelope.gain" in reason
     axis.note("recovered", "out_of_envelope")
     assert said("out_of_envelope")["trouble_why"] == ""
     assert said("")["trouble_why"] == ""
@@ -161,30 +156,30 @@ def test_the_status_says_why_there_is_a_trouble_until_it_is_over(axis_loop: Make
 
 def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     loop = axis_loop(META)
-    assert status_of(loop)["state"] == "no samples"
+    assert Health().state(axis_fields(loop)) == ("no samples", "none has come since the start")
     loop.offer(batches(0, 25)[0])
     loop.start()
     loop.close()
-    base = status_of(loop)
+    base = axis_fields(loop)
     good = health_after({"learnt": 100, "passed": 900})
     assert good.per_s == pytest.approx(1000)
-    assert good.state(base, 1) == ("ok", "")
-    assert good.state(base, 3)[0] == "thinned 1/3"
-    assert "1000 samples/s" in good.state(base, 3)[1]
-    assert health_after({"unexcited": 1000}).state(base, 1)[0] == "ok"
+    assert good.state(base) == ("ok", "")
+    assert good.state({**base, "thinning": 3})[0] == "thinned 1/3"
+    assert "1000 samples/s" in good.state({**base, "thinning": 3})[1]
+    assert health_after({"unexcited": 1000}).state(base)[0] == "ok"
     refusing = health_after({"learnt": 100, "glitch": 600, "timing": 300})
-    assert refusing.state(base, 1) == ("refusing", "most samples of the last 10 s are not learnt: glitch")
-    dropping = health_after({"learnt": 1000}, dropped=5.0).state(base, 1)
+    assert refusing.state(base) == ("refusing", "most samples of the last 10 s are not learnt: glitch")
+    dropping = health_after({"learnt": 1000}, dropped=5.0).state(base)
     assert dropping[0] == "dropping"
     assert "client.wait_learnt(seq)" in dropping[1]
-    assert good.state({**base, "stale": True}, 1) == ("stale", "no samples come")
-    behind = good.state({**base, "stale": True, "samples": {**base["samples"], "waiting": 9000}}, 1)
+    assert good.state({**base, "stale": True}) == ("stale", "no samples come")
+    behind = good.state({**base, "stale": True, "samples": {**base["samples"], "waiting": 9000}})
     assert behind[0] == "stale"
     assert "9000 samples wait" in behind[1]
     assert "client.wait_learnt(seq)" in behind[1]
-    assert good.state({**base, "trouble": "rail"}, 1)[0] == "rail"
-    assert good.state({**base, "learning": None}, 1)[0] == "not learning"
-    assert good.state({**base, "quality": {"valid": 0.0}}, 1)[0] == "unsure"
+    assert good.state({**base, "trouble": "rail"})[0] == "rail"
+    assert good.state({**base, "learning": None})[0] == "not learning"
+    assert good.state({**base, "quality": {"valid": 0.0}})[0] == "unsure"
 
 
 def test_a_learner_that_is_just_behind_is_stale_once() -> None:
@@ -203,10 +198,10 @@ def test_ok_comes_back_when_the_drops_are_over(axis_loop: Make) -> None:
     loop.offer(batches(0, 25)[0])
     loop.start()
     loop.close()
-    health, base = Health(), status_of(loop)
+    health, base = Health(), axis_fields(loop)
     states = []
     for k in range(30):
         health.update(float(k), 1000 * k, 50 if k >= 5 else 0, {"learnt": 1000 * k})
-        states.append(health.state(base, 1)[0])
+        states.append(health.state(base)[0])
     assert states[6] == "dropping"
     assert states[-1] == "ok"

@@ -45,7 +45,7 @@ def test_what_fails_has_a_name_until_it_is_over() -> None:
 
 def test_the_state_says_how_much_is_lost() -> None:
     status = {"trouble": NOT_RECORDED, "trouble_why": "samples_not_recorded (full)", "recorder": counters(lost=40)}
-    state, reason = Health().state(status, 1)
+    state, reason = Health().state(status)
     assert state == NOT_RECORDED
     assert "(full); 40 samples since the start are in no recording" in reason
 

@@ -9,7 +9,6 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,13 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sample_queue import SampleQueue
-from dehyst.service.operating.verbs import Request, Verbs
+from dehyst.service.operating.verbs import Request
 from dehyst.service.protocol.model import digests, fingerprint
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
+from dehyst.service.server.axis_verbs import axis_verbs
 from dehyst.service.storage import checkpoint
 from dehyst.service.storage import model_file as modelfile
 from dehyst.service.storage.checkpoint import (
@@ -196,11 +196,11 @@ def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back
     now_s = [time.monotonic()]
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     keeper = CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", kept, clock=lambda: now_s[0])
-    axis_with_list = SimpleNamespace(handled_seq=0, checkpoints=kept.entries)
-    verbs = Verbs(axis_with_list, lambda work: 0, {}, keeper.keep_listed)  # type: ignore[arg-type]
+    verbs = axis_verbs(axis, keeper, lambda work: 0, {})
 
     def listed() -> set[int]:
-        return {entry["checkpoint"] for entry in verbs.apply(Request("checkpoints", "alice"))[1]["checkpoints"]}
+        _, result = verbs["checkpoints"](Request("checkpoints", "alice"))
+        return {entry["checkpoint"] for entry in result["checkpoints"]}
 
     first = listed()
     assert len(first) > 5
@@ -237,14 +237,15 @@ def test_the_operator_freezes_selects_and_goes_back(tmp_path: Path) -> None:
     assert axis.served == "linear"
     with pytest.raises(InputError, match="sorcery"):
         axis.select("sorcery")
-    assert axis.checkpoints()[0]["seq"] == 1000
-    assert axis.rollback(1, "bob") == 2999
+    kept = folder(tmp_path)
+    assert kept.entries()[0]["seq"] == 1000
+    assert axis.rollback(kept.learner_of(1, axis.learner), 1, "bob") == 2999
     assert fingerprint(axis.newest.models["lssvm_adaptive"]) == good
     axis.handle(recording(3000, 500))
     assert axis.learning
     assert fingerprint(axis.newest.models["lssvm_adaptive"]) != good
     with pytest.raises(InputError, match="one of those there are"):
-        axis.rollback(77)
+        kept.learner_of(77, axis.learner)
     events = [(e["event"], e.get("by")) for e in axis.take_events()]
     assert events == [("frozen", "alice"), ("thawed", "alice"), ("selected", "bob"), ("rolled_back", "bob")]
 
