@@ -13,7 +13,7 @@ from dehyst.baselines.online_baseline import LeastSquaresConfig
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 from dehyst.baselines.prandtl_ishlinskii.operators import play_run
-from dehyst.baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
+from dehyst.baselines.swarm import TABLE_2_1_UPPER, bouc_wen_costs
 
 
 def warm() -> None:

@@ -109,7 +109,7 @@ class _Fit:
         return OptimizeResult(found, x=theta.copy())
 
 
-def _independent_samples(residual: FloatArray) -> float:
+def independent_samples(residual: FloatArray) -> float:
     """Number of independent samples in a residual, from its first autocorrelation.
 
     Model errors are not white: 10,000 samples of them may be worth ten.
@@ -151,7 +151,7 @@ def identify_bouc_wen(
         full = _Fit(u, y, dt, hold, free)
         best = full.solve(best.x, 25)
     without = full.solve(best.x, 25, inertia=False)
-    if (without.cost - best.cost) * _independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
+    if (without.cost - best.cost) * independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
         best = without
     residual, (d, offset, transient) = full.project(best.x)
     if not d > 0.0:

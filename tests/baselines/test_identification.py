@@ -23,7 +23,7 @@ from dehyst.baselines.linear import identify_linear
 from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
 from dehyst.baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
 from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from dehyst.baselines.swarm.identification import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
+from dehyst.baselines.swarm import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
 
 # --- Identification: known parameters come back, scale and offset hold, bad recordings are refused by name.
 
