@@ -247,7 +247,7 @@ def models_section(ours: Numbers, theirs: Numbers, pictures: dict[str, str]) -> 
         _weights_table("Table 2.2: MPI", "", ours["table_2_2"]["mpi"], theirs["table_2_2"]),
         _weights_table("Table 2.3: its inverse", "*", ours["table_2_3"]["mpi"], theirs["table_2_3"]),
         "The scale is fixed: the inverse saturation maps the recorded stroke onto itself. The published weights have "
-        "another one, and their dead zones are of no effect (w_s1 to w_s6 about 1e-4).\n",
+        "another one (w_s0 = 99.9999), and their dead zones are of no effect (w_s1 to w_s6 about 1e-4).\n",
         images(pictures, "2.10"),
         "## LSSVM: Figs. 2.11, 2.12\n",
         images(pictures, "2.11"),
@@ -337,8 +337,7 @@ def control_section(ours: Numbers, theirs: Numbers, pictures: dict[str, str]) ->
         "Ziegler and Nichols' experiment on the stage at T = 1 ms: ultimate gain "
         f"{gains['ultimate_gain_V_per_um']:.4f} V/µm, period {1e3 * gains['ultimate_period_s']:.2f} ms, hence PI gains "
         f"K_p = {gains['k_p_V_per_um']:.4f} V/µm, K_i = {gains['k_i_V_per_um_s']:.2f} V/(µm s) (published: "
-        f"{theirs['gains']['K_p']} and {theirs['gains']['K_i']}). The chapter's K_p is "
-        + ("stable here, too.\n" if gains["chapter_gains_stable"] else "above that, unstable here, and not used.\n"),
+        f"{theirs['gains']['K_p']} and {theirs['gains']['K_i']}). The chapter's K_p is " + _with_chapter_gains(ours),
         first,
         images(pictures, "2.17", "2.18", "2.19", "2.20"),
         *others,
@@ -354,6 +353,14 @@ def control_section(ours: Numbers, theirs: Numbers, pictures: dict[str, str]) ->
         ),
         images(pictures, "change"),
     ]
+
+
+def _with_chapter_gains(ours: Numbers) -> str:
+    """What the chapter's gains do on this stage."""
+    if not ours["gains"]["chapter_gains_stable"]:
+        return "above that, unstable here, and not used.\n"
+    loop = next(iter(ours["table_2_5"].values()))["lssvm_memory"]["FF+FB, chapter's gains"]
+    return f"stable here: with its gains FF+FB of the LSSVM with memory has a MAE of {loop['mae_pct']:.4f} %.\n"
 
 
 def _table_2_5(reference: str, ours: Numbers, theirs: Numbers) -> str:
