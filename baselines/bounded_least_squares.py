@@ -46,5 +46,6 @@ def bounded_minimum(normal: FloatArray, right: FloatArray, lower: FloatArray) ->
     if not (np.isfinite(L).all() and np.isfinite(right).all()):
         raise RuntimeError("the normal matrix is not finite and positive definite")
     # x'Nx/2 - r'x is half of |L'z - L^-1 r|² but for a constant, with z the scaled x.
-    found: FloatArray = bounded_least_squares(L.T, np.linalg.solve(L, right / scale), lower * scale) / scale
+    target = np.asarray(np.linalg.solve(L, right / scale), dtype=np.float64)
+    found: FloatArray = bounded_least_squares(L.T, target, lower * scale) / scale
     return found
