@@ -121,22 +121,30 @@ class Fit:
     kernel_variance: float
 
 
-def _linear(
-    features: FeatureMap, basis: FloatArray, target: FloatArray, u_range_V: float, dt_s: float
+def linear_posterior(
+    basis: FloatArray, target: FloatArray, deviations: FloatArray, variance: float, floor: float, repeats: float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Posterior mean (p,) and covariance (p, p) of the linear part; the noise level is the rms of its residual."""
-    precision = np.diag(prior_deviations(features, u_range_V) ** -2.0)
-    gram, moment = basis.T @ basis, basis.T @ target
-    repeats = max(1.0, CORRELATION_S / dt_s)
-    variance = (0.01 * u_range_V) ** 2
+    """Posterior mean (p,) and covariance (p, p) of a linear model of ``basis`` (n, p) and ``target`` (n,).
+
+    The prior has the standard ``deviations`` (p,). The noise is that of the residual, at least ``floor``; ``variance``
+    is its first guess. So many ``repeats`` of samples count as one measurement.
+    """
+    precision, gram, moment = np.diag(deviations**-2.0), basis.T @ basis, basis.T @ target
     beta: FloatArray = np.zeros(basis.shape[1])
     information = precision
     for _ in range(4):
         information = precision + gram / (variance * repeats)
         beta = np.asarray(np.linalg.solve(information, moment / (variance * repeats)), dtype=np.float64)
-        variance = max(float(np.mean((target - basis @ beta) ** 2)), (ERROR_FLOOR * u_range_V) ** 2)
+        variance = max(float(np.mean((target - basis @ beta) ** 2)), floor**2)
     covariance = np.linalg.inv(information)
-    return np.asarray(beta, dtype=np.float64), np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+    return beta, np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+
+
+def _linear(features: FeatureMap, basis: FloatArray, u_V: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (p,) and covariance (p, p) of the linear part of an inverse model."""
+    u_range_V = float(np.ptp(u_V))
+    deviations, floor = prior_deviations(features, u_range_V), ERROR_FLOOR * u_range_V
+    return linear_posterior(basis, u_V, deviations, (0.01 * u_range_V) ** 2, floor, max(1.0, CORRELATION_S / dt_s))
 
 
 def select(kernel: FloatArray, widths: FloatArray, n: int) -> NDArray[np.int64]:
@@ -174,7 +182,7 @@ def tune(
     """
     target = u_V
     if features.linear:
-        beta, _ = _linear(features, basis, u_V, float(np.ptp(u_V)), dt_s)
+        beta, _ = _linear(features, basis, u_V, dt_s)
         target = u_V - basis @ beta
     rows = select(kernel, np.ones(kernel.shape[1]), config.n)
     gamma, widths = evidence_search(kernel[rows], target[rows])
@@ -192,25 +200,15 @@ def fit_model(
     widths: FloatArray,
 ) -> Fit:
     """Fit the model to basis (n, p), kernel inputs (n, d) and voltages (n,), V, with given gamma and widths (d,)."""
-    u_range = float(np.ptp(u))
     rows = select(kernel, widths, config.n)
-    if not features.linear:
-        fit = lssvm.fit(kernel[rows], u[rows], widths, gamma)
-        return Fit(
-            fit.model.beta,
-            np.empty((0, 0)),
-            fit.model.X,
-            fit.model.alpha,
-            float(np.mean(fit.leave_one_out() ** 2)),
-            fit.model.scale,
-        )
-    beta, covariance = _linear(features, basis, u, u_range, dt_s)
-    fit = lssvm.fit(kernel[rows], u[rows] - basis[rows] @ beta, widths, gamma)
-    beta = beta.copy()
-    beta[0] += fit.model.beta[0]
-    return Fit(
-        beta, covariance, fit.model.X, fit.model.alpha, float(np.mean(fit.leave_one_out() ** 2)), fit.model.scale
-    )
+    beta, covariance, target = np.zeros(1), np.empty((0, 0)), u[rows]
+    if features.linear:
+        beta, covariance = _linear(features, basis, u, dt_s)
+        target = target - basis[rows] @ beta
+    fit = lssvm.fit(kernel[rows], target, widths, gamma)
+    beta[0] += fit.model.bias
+    left_out = fit.leave_one_out()
+    return Fit(beta, covariance, fit.model.X, fit.model.alpha, float(np.mean(left_out**2)), fit.model.scale)
 
 
 def evidence_search(kernel: FloatArray, target: FloatArray) -> tuple[float, FloatArray]:

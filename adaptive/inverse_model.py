@@ -51,59 +51,6 @@ def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no co
 
 
 @compiled
-def evaluate(
-    y: FloatArray,
-    v: FloatArray,
-    a: FloatArray,
-    memory: FloatArray,
-    m: FeatureArrays,
-    beta: FloatArray,
-    beta_covariance: FloatArray,
-    scaled: FloatArray,
-    alpha: FloatArray,
-    inverse_widths: FloatArray,
-    noise_variance: float,
-    kernel_variance: float,
-    shrink: float,
-    domain: FloatArray,
-    anchor: FloatArray,
-    allowed: float,
-    u: FloatArray,
-    std: FloatArray,
-    inside: BoolArray,
-) -> None:  # pragma: no cover - compiled
-    """Voltages, deviations and domain flags of n points; ``memory`` advances in place.
-
-    ``anchor`` (p,) or (0,): linear part from which the voltage may differ by at most ``allowed``, V.
-    """
-    n = y.shape[0]
-    d, count = scaled.shape
-    p = beta.shape[0]
-    basis = np.empty(p)
-    x = np.empty(d)
-    k = np.empty(count)
-    bits = np.empty(count)
-    for i in range(n):
-        advance(y[i], memory, m)
-        fill(y[i], v[i], a[i], memory, m, basis, x)
-        mean = dot(beta, basis, p)
-        variance = noise_variance + spread(beta_covariance, basis)
-        nearest = 0.0
-        if count > 0:
-            for j in range(d):
-                x[j] *= inverse_widths[j]
-            rbf_column(scaled, count, x, k, bits)
-            kernel_part, nearest = weigh(k, alpha)
-            mean += kernel_part
-        if anchor.shape[0] > 0:
-            known = dot(anchor, basis, p)
-            mean = min(max(mean, known - allowed), known + allowed)
-        u[i] = mean
-        std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
-        inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
-
-
-@compiled
 def unpacked(
     constants: FloatArray, counts: IntArray
 ) -> tuple[FeatureArrays, FloatArray, FloatArray, FloatArray, FloatArray, int]:  # pragma: no cover - compiled
@@ -130,30 +77,40 @@ def unpacked(
 
 @compiled
 def evaluate_packed(
-    y: FloatArray,
-    v: FloatArray,
-    a: FloatArray,
-    memory: FloatArray,
-    constants: FloatArray,
-    counts: IntArray,
-    u: FloatArray,
-    std: FloatArray,
-    inside: BoolArray,
-) -> None:  # pragma: no cover - compiled
-    """`evaluate` with the whole model in two arrays, as `LssvmInverse` packs it.
+    y: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray, constants: FloatArray, counts: IntArray,
+    u: FloatArray, std: FloatArray, inside: BoolArray,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Voltages, deviations and domain flags of n points; ``memory`` advances in place.
 
-    To hand over twenty arrays costs more than to evaluate one point.
+    The whole model is in two arrays, as `LssvmInverse` packs it: to hand over twenty costs more than to evaluate a
+    point. Its anchor (p,) or (0,) is the linear part from which the voltage may differ by at most ``allowed``, V.
     """
     m, beta, inverse_widths, alpha, scaled, at = unpacked(constants, counts)
-    c, p = counts[6], beta.shape[0]
+    c, p, d, count = counts[6], beta.shape[0], scaled.shape[0], scaled.shape[1]
     covariance = constants[at : at + c * c].reshape(c, c)
     at += c * c
     anchor = constants[at : at + counts[9] * p]
-    scalars, domain = constants[3:7], constants[7:13]
-    evaluate(
-        y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
-        anchor, scalars[3], u, std, inside,
-    )  # fmt: skip
+    noise_variance, kernel_variance, shrink, allowed = constants[3], constants[4], constants[5], constants[6]
+    domain = constants[7:13]
+    basis, x, k, bits = np.empty(p), np.empty(d), np.empty(count), np.empty(count)
+    for i in range(y.shape[0]):
+        advance(y[i], memory, m)
+        fill(y[i], v[i], a[i], memory, m, basis, x)
+        mean = dot(beta, basis, p)
+        variance = noise_variance + spread(covariance, basis)
+        nearest = 0.0
+        if count > 0:
+            for j in range(d):
+                x[j] *= inverse_widths[j]
+            rbf_column(scaled, count, x, k, bits)
+            kernel_part, nearest = weigh(k, alpha)
+            mean += kernel_part
+        if anchor.shape[0] > 0:
+            known = dot(anchor, basis, p)
+            mean = min(max(mean, known - allowed), known + allowed)
+        u[i] = mean
+        std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
+        inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
 
 
 @compiled
@@ -270,11 +227,15 @@ class LssvmInverse(Kinded):
                 object.__setattr__(self, shared, value)
             return
         p, d, n = self.features.basis_size, self.features.kernel_size, self.support.shape[0]
-        shapes = {"beta": (p,), "support": (n, d), "alpha": (n,), "widths": (d,), "domain": (6,)}
-        for name, shape in shapes.items():
+        shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+            "beta": ((p,),), "support": ((n, d),), "alpha": ((n,),), "widths": ((d,),), "domain": ((6,),),
+            "anchor": ((p,), (0,)), "beta_covariance": ((p, p), (0, 0)),
+        }  # fmt: skip
+        for name, allowed in shapes.items():
             value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != shape or not np.all(np.isfinite(value)):
-                raise InputError(f"{name}: got shape {value.shape}, expected {shape} finite numbers")
+            if value.shape not in allowed or not np.all(np.isfinite(value)):
+                expected = " or ".join(map(str, allowed))
+                raise InputError(f"{name}: got shape {value.shape}, expected {expected} finite numbers")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         # What is stated as a deviation is the root of these.
@@ -284,17 +245,6 @@ class LssvmInverse(Kinded):
             if not math.isfinite(number) or number < 0.0 or (number == 0.0 and name in positive):
                 expected = "above" if name in positive else "of at least"
                 raise InputError(f"{name}: got {number}, expected a finite number {expected} 0")
-        anchor = np.array(self.anchor, dtype=np.float64)
-        if anchor.shape not in ((0,), (p,)) or not np.all(np.isfinite(anchor)):
-            raise InputError(f"anchor: got shape {anchor.shape}, expected ({p},) finite numbers, or (0,)")
-        anchor.flags.writeable = False
-        object.__setattr__(self, "anchor", anchor)
-        covariance = np.array(self.beta_covariance, dtype=np.float64)
-        if covariance.shape not in ((0, 0), (p, p)) or not np.all(np.isfinite(covariance)):
-            expected = f"({p}, {p}) finite numbers, or (0, 0)"
-            raise InputError(f"beta_covariance: got shape {covariance.shape}, expected {expected}")
-        covariance.flags.writeable = False
-        object.__setattr__(self, "beta_covariance", covariance)
         scaled = np.ascontiguousarray((self.support / self.widths).T)
         scaled.flags.writeable = False
         object.__setattr__(self, "_scaled", scaled)
@@ -303,11 +253,11 @@ class LssvmInverse(Kinded):
         m = self.features.arrays
         scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma), self.allowed_V)
         parts = (m.frame, scalars, margins, m.scale, m.thresholds, m.arcs, m.retain, self.beta, 1.0 / self.widths,
-                 self.alpha, scaled.ravel(), covariance.ravel(), anchor)  # fmt: skip
+                 self.alpha, scaled.ravel(), self.beta_covariance.ravel(), self.anchor)  # fmt: skip
         object.__setattr__(self, "_constants", np.concatenate(parts))
-        sizes = [m.thresholds.size, m.arcs.size, m.retain.size, p, d, n, covariance.shape[0]]
+        sizes = [m.thresholds.size, m.arcs.size, m.retain.size, p, d, n, self.beta_covariance.shape[0]]
         object.__setattr__(
-            self, "_counts", np.array([*sizes, *m.flags, anchor.size > 0, *m.kernel_plays], dtype=np.int64)
+            self, "_counts", np.array([*sizes, *m.flags, self.anchor.size > 0, *m.kernel_plays], dtype=np.int64)
         )
 
     def _shared_with(self, like: LssvmInverse) -> dict[str, FloatArray | IntArray]:

@@ -93,11 +93,3 @@ def inverse_from_cholesky(matrix: FloatArray, count: int | None = None) -> None:
     info = _call("dpotri", matrix, n) if n else 0
     if info != 0:
         raise NumericsError(f"kernel matrix: diagonal element {info} of its factor is zero; lower gamma")
-
-
-def mirror_lower(matrix: FloatArray, count: int | None = None) -> None:
-    """Copy the lower triangle of ``matrix[:count, :count]`` over its upper one."""
-    n = matrix.shape[0] if count is None else count
-    block = matrix[:n, :n]
-    upper = np.triu_indices(n, 1)
-    block[upper] = block.T[upper]

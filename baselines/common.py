@@ -1,17 +1,19 @@
-"""What all baselines share: the report of a fit, argument checks."""
+"""What all baselines share: the report of a fit, argument checks, the served inverse."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dehyst.adaptive.compiled import all_finite
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import Entry
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.state import Entry, load, save
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 
 # --- How well an identified baseline fits its recording, and the motion that the recording covers.
 
@@ -97,11 +99,6 @@ class FitReport:
         )
 
 
-def std_of_voltage(u_V: ArrayLike, report: FitReport) -> float:
-    """Standard deviation of the voltage, V: the RMSE divided by the mean slope of the recording."""
-    return report.rmse_um * float(np.ptp(np.asarray(u_V, dtype=np.float64))) / report.range_um
-
-
 # --- Argument checks: each returns the checked value as float64 and raises InputError naming the argument otherwise.
 
 
@@ -110,14 +107,6 @@ def positive(field: str, value: float, unit: str) -> float:
     number = float(value)
     if not (np.isfinite(number) and number > 0.0):
         raise InputError(f"{field}: got {value!r}, expected a finite number above 0 {unit}")
-    return number
-
-
-def std_or_nan(field: str, value: float, unit: str) -> float:
-    """A standard deviation: a finite number of at least 0, or NaN where it is unknown."""
-    number = float(value)
-    if not (np.isnan(number) or 0.0 <= number < np.inf):
-        raise InputError(f"{field}: got {value!r}, expected a finite number of at least 0 {unit}, or NaN for unknown")
     return number
 
 
@@ -148,32 +137,119 @@ def checked_recording(
     return u, y, dt
 
 
-def of_length(name: str, values: FloatArray, n: int) -> FloatArray:
-    """A contiguous array (n,)."""
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim != 1 or array.shape[0] != n:
-        raise InputError(f"{name}: got shape {array.shape}, expected ({n},), as many as y_um; pass one value per point")
-    return array
+# --- The served inverse.
 
 
-def checked_motion(
-    y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacement, velocity and acceleration of a query as contiguous arrays (n,) of one length."""
-    y = np.ascontiguousarray(y_um, dtype=np.float64)
-    if y.ndim != 1:
-        raise InputError(f"y_um: got shape {y.shape}, expected (n,); pass a flat trajectory")
-    n = y.shape[0]
-    return y, of_length("v_um_per_s", v_um_per_s, n), of_length("a_um_per_s2", a_um_per_s2, n)
+@dataclass(frozen=True)
+class BaselineInverse(ABC):
+    """Inverse of an identified stage; implements ``adaptive.types.InverseModel``. A model derives from it.
+
+    ``voltage_std_V`` is one standard deviation of the voltage, from the residual of the identification; NaN: unknown.
+    """
+
+    parameters: Any
+    dt_s: Annotated[float, Entry("sample time", "s")]
+    domain: Annotated[Domain, Entry("motion of the identification", name="")]
+    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
+    name: Annotated[str, Entry("by which it is served", most=1000)] = ""
+
+    def __post_init__(self) -> None:
+        positive("dt_s", self.dt_s, "s")
+        std_V = float(self.voltage_std_V)
+        if not (math.isnan(std_V) or 0.0 <= std_V < math.inf):
+            raise InputError(
+                f"voltage_std_V: got {std_V}, expected a finite number of at least 0 V, or NaN for unknown"
+            )
+
+    @classmethod
+    def of(cls, parameters: Any, report: FitReport, u_V: ArrayLike, serve_dt_s: float | None) -> tuple[Self, FitReport]:
+        """The inverse of ``parameters``, and their ``report``. u_V : voltages of the recording. serve_dt_s : sample
+        time of the queries, s; None: that of the recording. The deviation is the RMSE divided by the mean slope.
+        """
+        std_V = report.rmse_um * float(np.ptp(np.asarray(u_V, dtype=np.float64))) / report.range_um
+        return cls(parameters, serve_dt_s or report.dt_s, report.domain, std_V), report
+
+    # ---- what a model has of its own
+
+    @property
+    @abstractmethod
+    def memory_size(self) -> int:
+        """Number of values in a memory."""
+
+    @abstractmethod
+    def _run(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        inside: BoolArray,
+    ) -> None:  # fmt: skip
+        """Write voltages and domain flags of (n,) points; ``memory`` is advanced in place."""
+
+    @abstractmethod
+    def _drive(self, u_V: FloatArray, memory: FloatArray) -> None:
+        """Advance ``memory`` in place by (n,) applied voltages; values that are not finite are skipped."""
+
+    def _start(self) -> FloatArray:
+        """(m,) memory at rest at 0 V."""
+        return np.zeros(self.memory_size)
+
+    # ---- the inverse model
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """(m,) memory after a monotone motion from rest at 0 V to ``y_um`` µm."""
+        y, rest = np.array([float(y_um)]), np.zeros(1)
+        return self.feedforward(y, rest, rest, self._start()).memory
+
+    def feedforward(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """Voltages (n,) V for points (n,). Raises InputError on bad shapes."""
+        y, v, a = _columns(y_um=y_um, v_um_per_s=v_um_per_s, a_um_per_s2=a_um_per_s2)
+        after = self._checked(memory)
+        u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
+        self._run(y, v, a, after, u, inside)
+        return Feedforward(u, np.full(y.size, self.voltage_std_V), inside, after)
+
+    def track(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
+    ) -> FloatArray:
+        """(m,) memory after the voltages ``u_V`` (n,) were applied: they alone drive it, and carry no sensor noise.
+
+        Values that are not finite are skipped. Raises InputError on bad shapes.
+        """
+        *_, u = _columns(y_um=y_um, v_um_per_s=v_um_per_s, a_um_per_s2=a_um_per_s2, u_V=u_V)
+        after = self._checked(memory)
+        self._drive(u, after)
+        return after
+
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
+        self._drive(u_V, memory)
+
+    def _checked(self, memory: FloatArray) -> FloatArray:
+        """A copy of a caller's memory, (m,) and finite."""
+        copy, size = np.array(memory, dtype=np.float64), self.memory_size
+        if copy.shape != (size,):
+            raise InputError(
+                f"memory: got shape {copy.shape}, expected ({size},); send the memory of this model's last reply"
+            )
+        if size and not all_finite(copy):
+            raise InputError(f"memory: got {copy.tolist()}, expected finite values; start from rest_memory")
+        return copy
+
+    def state_dict(self) -> StateDict:
+        """Flat numbers and vectors by name."""
+        return save(self)
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> Self:
+        """Inverse of ``state_dict``. Raises ModelFileError where a field is missing or wrong."""
+        return load(cls, state)
 
 
-def checked_memory(memory: FloatArray, size: int) -> FloatArray:
-    """A copy of a caller's memory, (size,) and finite."""
-    copy = np.array(memory, dtype=np.float64)
-    if copy.shape != (size,):
-        raise InputError(
-            f"memory: got shape {copy.shape}, expected ({size},); send the memory of this model's last reply"
-        )
-    if size and not all_finite(copy):
-        raise InputError(f"memory: got {copy.tolist()}, expected finite values; start from rest_memory")
-    return copy
+def _columns(**given: FloatArray) -> list[FloatArray]:
+    """The columns of a query as contiguous arrays (n,) of one length."""
+    arrays = [np.ascontiguousarray(values, dtype=np.float64) for values in given.values()]
+    for name, array in zip(given, arrays, strict=True):
+        if array.ndim != 1 or array.shape != arrays[0].shape:
+            n = arrays[0].size if arrays[0].ndim == 1 else "n"
+            raise InputError(f"{name}: got shape {array.shape}, expected ({n},); pass flat columns, a value a point")
+    return arrays

@@ -10,19 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import Entry, load, save
-from dehyst.adaptive.types import Feedforward, FloatArray, StateDict
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR
-from dehyst.baselines.common import (
-    Domain,
-    FitReport,
-    checked_memory,
-    checked_motion,
-    checked_recording,
-    positive,
-    std_of_voltage,
-    std_or_nan,
-)
+from dehyst.baselines.common import BaselineInverse, FitReport, checked_recording
 from dehyst.baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
 
 
@@ -57,63 +48,25 @@ def identify_linear(u_V: ArrayLike, y_um: ArrayLike, dt_s: float) -> tuple[Linea
 
 
 @dataclass(frozen=True)
-class LinearInverse:
-    """Inverse of :class:`LinearParameters`; implements ``adaptive.types.InverseModel`` under the name ``linear``.
-
-    ``voltage_std_V`` is one standard deviation of the voltage, from the residual of the identification; NaN: unknown.
-    """
+class LinearInverse(BaselineInverse):
+    """Inverse of :class:`LinearParameters`. It has no memory."""
 
     parameters: Annotated[LinearParameters, Entry("the identified stage", name="")]
-    dt_s: Annotated[float, Entry("sample time", "s")]
-    domain: Annotated[Domain, Entry("motion of the identification", name="")]
-    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
     name: Annotated[str, Entry("by which it is served", most=1000)] = "linear"
-
-    def __post_init__(self) -> None:
-        positive("dt_s", self.dt_s, "s")
-        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
 
     @property
     def memory_size(self) -> int:
-        """0: the model has no memory."""
         return 0
 
-    def rest_memory(self, y_um: float) -> FloatArray:
-        """Empty (0,)."""
-        return np.empty(0)
+    def _run(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        inside: BoolArray,
+    ) -> None:  # fmt: skip
+        u_V[:] = (y_um - self.parameters.offset_um) / self.parameters.gain_um_per_V
+        inside[:] = (y_um >= self.domain.y_min_um) & (y_um <= self.domain.y_max_um)
 
-    def feedforward(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
-    ) -> Feedforward:
-        """Voltages (n,) V for displacements (n,) µm. Raises InputError on bad shapes."""
-        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
-        p, domain = self.parameters, self.domain
-        return Feedforward(
-            u_V=(y - p.offset_um) / p.gain_um_per_V,
-            std_V=np.full(y.size, self.voltage_std_V),
-            inside=(y >= domain.y_min_um) & (y <= domain.y_max_um),
-            memory=checked_memory(memory, 0),
-        )
-
-    def track(
-        self,
-        y_um: FloatArray,
-        v_um_per_s: FloatArray,
-        a_um_per_s2: FloatArray,
-        u_V: FloatArray,
-        memory: FloatArray,
-    ) -> FloatArray:
-        """Empty (0,)."""
-        return checked_memory(memory, 0)
-
-    def state_dict(self) -> StateDict:
-        """Flat numbers and vectors by name."""
-        return save(self)
-
-    @staticmethod
-    def from_state(state: StateDict) -> LinearInverse:
-        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
-        return load(LinearInverse, state)
+    def _drive(self, u_V: FloatArray, memory: FloatArray) -> None:
+        return
 
 
 def fit_linear(
@@ -125,7 +78,7 @@ def fit_linear(
     recording.
     """
     parameters, report = identify_linear(u_V, y_um, dt_s)
-    return LinearInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report
+    return LinearInverse.of(parameters, report, u_V, serve_dt_s)
 
 
 class LinearOnline(LeastSquaresOnline):

@@ -332,6 +332,8 @@ class LeastSquaresOnline(OnlineBaseline):
 
     def __init__(self, dt_s: float, u_range_V: float, config: LeastSquaresConfig, rows: FloatArray) -> None:
         super().__init__(dt_s, config.settle)
+        import scipy.optimize  # noqa: F401 - slow to import: here, so that no sample waits for it
+
         self.config = config
         self._step_V = config.excitation * u_range_V
         self._keep = 1.0 - 1.0 / config.remember

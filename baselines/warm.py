@@ -7,13 +7,12 @@ import numpy as np
 from dehyst.adaptive.types import Sample
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from dehyst.baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
-from dehyst.baselines.bounded_least_squares import bounded_minimum
 from dehyst.baselines.common import Domain
 from dehyst.baselines.online_baseline import LeastSquaresConfig
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline
 from dehyst.baselines.prandtl_ishlinskii.operators import play_run
-from dehyst.baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
+from dehyst.baselines.swarm import TABLE_2_1_UPPER, bouc_wen_costs
 
 
 def warm() -> None:
@@ -36,7 +35,6 @@ def warm() -> None:
     ):
         for k in range(20):
             online.handle(Sample(k, k * 1e-3, 0.1 * k, k))
-    bounded_minimum(np.eye(2), np.ones(2), np.zeros(2))
 
 
 if __name__ == "__main__":

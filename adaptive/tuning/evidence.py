@@ -1,25 +1,25 @@
 """Three levels of Bayesian inference for the LSSVM, (2.33)-(2.36), with gradients and without eigenvectors.
 
 Level 1 gives beta and alpha, level 2 gamma, level 3 the kernel widths. In the notation of `adaptive.lssvm`, with
-D = diag(1/(gamma w)), Pc = P - P H (H'PH)^-1 H'P, alpha = Pc y, 2 J1 = y'alpha and p unpenalised coefficients:
+D = diag(1/(gamma w)), Pc = P - S S'/G with G = 1'S, alpha = Pc y and 2 J1 = y'alpha:
 
     E_D = ½ sum w_i e_i²,  e_i = alpha_i/(gamma w_i);   E_W = J1 - gamma E_D;   N - Geff = tr(Pc D)
-    mu = (Geff - p)/(2 E_W),  zeta = (N - Geff)/(2 E_D)
-    J2 = log|R| + log|H'PH| - log|H'H| + (N - p) log J1           (minus twice the log evidence, up to a constant)
-    J3 = J2 + log(Geff - p) + log(N - Geff)
+    mu = (Geff - 1)/(2 E_W),  zeta = (N - Geff)/(2 E_D)
+    J2 = log|R| + log(G/N) + (N - 1) log J1                       (minus twice the log evidence, up to a constant)
+    J3 = J2 + log(Geff - 1) + log(N - Geff)
 
-For H = [1] these are the chapter's; a wider H has a flat prior on its coefficients. One evaluation with all
-gradients costs one factorisation, one inverse and, for level 3, one matrix product.
+One evaluation with all gradients costs one factorisation, one inverse and, for level 3, one matrix product.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.adaptive import kernels, lapack, lssvm
+from dehyst.adaptive import kernels, lapack
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 
@@ -30,7 +30,6 @@ class EvidenceSamples:
 
     X: FloatArray
     y: FloatArray
-    H: FloatArray
     weights: FloatArray
 
     @property
@@ -45,26 +44,23 @@ class EvidenceSamples:
 
     def subset(self, rows: NDArray[np.int64]) -> EvidenceSamples:
         """Some of the rows."""
-        return EvidenceSamples(self.X[rows], self.y[rows], self.H[rows], self.weights[rows])
+        return EvidenceSamples(self.X[rows], self.y[rows], self.weights[rows])
 
 
-def evidence_samples(
-    X: FloatArray, y: FloatArray, weights: FloatArray | None = None, linear: tuple[int, ...] = ()
-) -> EvidenceSamples:
+def evidence_samples(X: FloatArray, y: FloatArray, weights: FloatArray | None = None) -> EvidenceSamples:
     """Check and collect normalised samples; arguments as those of `lssvm.fit`. Raises InputError."""
     X, y = np.ascontiguousarray(X, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
     if X.ndim != 2 or y.shape != (X.shape[0],):
         raise InputError(f"X, y: got shapes {X.shape} and {y.shape}, expected (N, d) and (N,)")
-    linear = lssvm.check_linear(linear, X.shape[1])
-    if y.size < len(linear) + 4:
-        raise InputError(f"X: got {y.size} samples, expected at least {len(linear) + 4} to infer hyper-parameters from")
+    if y.size < 4:
+        raise InputError(f"X: got {y.size} samples, expected at least 4 to infer hyper-parameters from")
     w = np.ones(y.size) if weights is None else np.ascontiguousarray(weights, dtype=np.float64)
     finite = np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(w))
     if not finite or w.shape != y.shape or not np.all(w > 0):
         raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
     if np.ptp(y) == 0:
         raise InputError("y: all targets are equal, nothing can be inferred from them; excite the stage")
-    return EvidenceSamples(X, y, lssvm.design(X, linear), w)
+    return EvidenceSamples(X, y, w)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +98,7 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
     ------
     NumericsError : R is singular in double precision at these hyper-parameters.
     """
-    n, p = data.size, data.H.shape[1]
+    n = data.size
     K = kernels.gram(data.X, None, widths)
     noise = 1.0 / (gamma * data.weights)
     P = K.copy()
@@ -113,8 +109,9 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
     Pc = np.tril(P, -1)
     Pc += Pc.T
     Pc[np.diag_indices(n)] = np.diag(P)
-    S = Pc @ data.H
-    G = data.H.T @ S
+    ones = np.ones((n, 1))
+    S = Pc @ ones
+    G = ones.T @ S
     Pc -= S @ np.linalg.solve(G, S.T)
     alpha = Pc @ data.y
     twice_J1 = float(data.y @ alpha)
@@ -123,10 +120,9 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
     E_W = 0.5 * (twice_J1 - fit)
     left = float(np.diag(Pc) @ noise)  # N - Geff
     effective = n - left
-    log_design = float(np.linalg.slogdet(G)[1] - np.linalg.slogdet(data.H.T @ data.H)[1])
-    J2 = log_det + log_design + (n - p) * np.log(0.5 * twice_J1)
-    J3 = J2 + np.log(max(effective - p, 1e-300)) + np.log(max(left, 1e-300))
-    share = (n - p) / twice_J1
+    J2 = log_det + log(abs(G[0, 0])) - log(n) + (n - 1) * np.log(0.5 * twice_J1)
+    J3 = J2 + np.log(max(effective - 1.0, 1e-300)) + np.log(max(left, 1e-300))
+    share = (n - 1) / twice_J1
     by_gamma = -left + share * fit
     widths_gradient = _by_widths(data.X, widths, K, Pc - share * np.outer(alpha, alpha))
     third, curvature = np.full(data.dimension, np.nan), np.nan
@@ -141,7 +137,7 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
         fit_by_gamma = 2.0 * float(v @ (noise * alpha)) - fit
         curvature = -left_by_gamma + share * (fit_by_gamma - fit * fit / twice_J1)
         mixed = along_M + share * (-2.0 * along_v + fit * along_alpha / twice_J1)
-        by_left = 1.0 / left - 1.0 / (effective - p)
+        by_left = 1.0 / left - 1.0 / (effective - 1.0)
         shift = -mixed / curvature  # d log gamma / d log width along the optimum of J2
         third = widths_gradient - by_left * along_M + (by_gamma + by_left * left_by_gamma) * shift
     return Evidence(
@@ -150,7 +146,7 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
         E_W,
         E_D,
         effective,
-        (effective - p) / (2.0 * E_W),
+        (effective - 1.0) / (2.0 * E_W),
         left / (2.0 * E_D),
         float(J2),
         float(J3),

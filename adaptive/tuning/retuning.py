@@ -8,7 +8,6 @@ background process can run them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +17,12 @@ from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.lapack import one_thread
 from dehyst.adaptive.online.kernel_window import SAME
 from dehyst.adaptive.tuning.config import RetuneConfig
-from dehyst.adaptive.tuning.evidence import EvidenceSamples, evidence_samples
+from dehyst.adaptive.tuning.evidence import evidence_samples
 from dehyst.adaptive.tuning.search import REFUSED, CountedEvidence, descend
 from dehyst.adaptive.types import BoolArray, FloatArray, Hyperparameters, WindowData
 from dehyst.adaptive.window.arrays import Status
 from dehyst.adaptive.window.window import Window, WindowConfig
 
-#: ``search(data, start, low, high)``: (s, 1 + d) starts worth a descent, best first, in logarithms of gamma and widths.
-Search = Callable[[EvidenceSamples, FloatArray, FloatArray, FloatArray], FloatArray]
 #: Fewest independent samples for a comparison: the standard deviation of fewer is too uncertain.
 _FEWEST = 8.0
 
@@ -54,12 +51,11 @@ def bounds_of(hyper: Hyperparameters, config: RetuneConfig) -> tuple[FloatArray,
 
 
 @one_thread
-def propose(data: WindowData, config: RetuneConfig | None = None, search: Search | None = None) -> Proposal:
+def propose(data: WindowData, config: RetuneConfig | None = None) -> Proposal:
     """The hyper-parameters with the best evidence on ``data``, or the present ones where none are better.
 
-    With one BLAS thread, as `adaptive.tuning.search.infer`. ``search`` gives the starts in place of `pattern`. Raises
-    InputError on too few samples or targets that are all equal, NumericsError where the present values cannot be
-    evaluated.
+    With one BLAS thread, as `adaptive.tuning.search.infer`. Raises InputError on too few samples or targets that are
+    all equal, NumericsError where the present values cannot be evaluated.
     """
     config = config or RetuneConfig()
     n = data.targets_V.shape[0]
@@ -79,8 +75,8 @@ def propose(data: WindowData, config: RetuneConfig | None = None, search: Search
         raise NumericsError(
             "evidence: the present hyper-parameters cannot be evaluated on the window's samples; narrow gamma_range"
         )
-    starts = pattern(here, low, high, config.starts) if search is None else search(part, here, low, high)
-    found = [descend(partial.J2, start, low, high, config.iterations, 1e-9) for start in starts[: config.starts]]
+    starts = pattern(here, low, high, config.starts)
+    found = [descend(partial.J2, start, low, high, config.iterations, 1e-9) for start in starts]
     # The best of the descents on a part continues on all samples, beside the present values.
     first = min(found, key=lambda point: partial.J2(point)[0], default=here)
     ends = [here, *(descend(objective.J2, start, low, high, config.iterations, 1e-9) for start in (first, here))]

@@ -51,9 +51,9 @@ class WindowArrays(NamedTuple):
 
 
 # Rows of V. Y: targets. W: noise weights. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
-# PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. DIAGONAL: that of R^-1 by slot,
-# where the Cholesky form carries it along. The others are scratch.
-Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K, DIAGONAL = range(13)
+# PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. The others are scratch. The
+# last row is not used now, has its place in states.
+Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K = range(12)
 ROWS = 13
 
 # Rows of U. UNDO_POINT: beta, then the features of the slot.
@@ -64,8 +64,8 @@ UNDO_ROWS = 5
 GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, BETA, GRAM = range(9)
 FLOATS = 9
 
-# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE: not used now, has its place in states.
-# CARRIED: number of steps for which the Cholesky form still updates DIAGONAL; 0 where it is not valid.
+# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE and the last: not used now, have their
+# place in states.
 (
     COUNT,
     FORM,
@@ -82,8 +82,7 @@ FLOATS = 9
     UNDONE,
     ROUNDS,
     UNDO_PLACE,
-    CARRIED,
-) = range(16)
+) = range(15)
 COUNTERS = 16
 #: In the Cholesky form, which has no pending term: replacements since the factor was copied to ``kept``; 0 without one.
 LOGGED = PENDING

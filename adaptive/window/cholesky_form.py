@@ -24,22 +24,8 @@ import numpy as np
 
 from dehyst.adaptive.compiled import compiled_reassociating, dot
 from dehyst.adaptive.types import FloatArray
-from dehyst.adaptive.window.arrays import (
-    BITS,
-    CARRIED,
-    COUNT,
-    CURSOR,
-    DIAGONAL,
-    KEPT_STEPS,
-    LOGGED,
-    MINUS,
-    PLUS,
-    SY,
-    TRIAL,
-    K,
-    WindowArrays,
-    Y,
-)
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window.arrays import WindowArrays
 
 # --- The O(N²) passes over the factor. Several columns go together, so that the vectors beside it are read once for all
 # of them. Inner loops run from 0 over slices, so that no index is checked for being negative.
@@ -149,7 +135,7 @@ def _rotate_columns(A: WindowArrays, n: int, place: int, x: FloatArray, b: Float
 
     They gain the new row, and take part in b <- L^-1 b. Four columns at a time. ``x`` is used up.
     """
-    P, order, S, sy = A.P, A.order, A.S, A.V[SY]
+    P, order, S, sy = A.P, A.order, A.S, A.V[ws.SY]
     tau, tau_y = S[place], sy[place]
     k = place + 1
     while k + 3 < n:
@@ -246,7 +232,7 @@ def _rotate_targets(
 @compiled_reassociating
 def position_of(A: WindowArrays, slot: int) -> int:
     """Position in the factor of a slot, -1 where it has none."""
-    for i in range(A.C[COUNT]):
+    for i in range(A.C[ws.COUNT]):
         if A.order[i] == slot:
             return i
     return -1
@@ -255,20 +241,20 @@ def position_of(A: WindowArrays, slot: int) -> int:
 @compiled_reassociating
 def gather(A: WindowArrays, by_slot: FloatArray, by_position: FloatArray) -> None:
     """Reorder a vector from slots to positions."""
-    for i in range(A.C[COUNT]):
+    for i in range(A.C[ws.COUNT]):
         by_position[i] = by_slot[A.order[i]]
 
 
 @compiled_reassociating
 def forward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L^-1 b in place, by position."""
-    _forward_columns(A, A.C[COUNT], b)
+    _forward_columns(A, A.C[ws.COUNT], b)
 
 
 @compiled_reassociating
 def backward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L'^-1 b in place, by position."""
-    _backward_columns(A, A.C[COUNT], b)
+    _backward_columns(A, A.C[ws.COUNT], b)
 
 
 @compiled_reassociating
@@ -278,7 +264,7 @@ def _exchange(A: WindowArrays, place: int, b: FloatArray) -> None:
     ``b`` is by position without the one that leaves. Its slot goes to the end of ``order``; the diagonal element of
     the new sample is still missing.
     """
-    n, x, order = A.C[COUNT], A.V[PLUS], A.order
+    n, x, order = A.C[ws.COUNT], A.V[ws.PLUS], A.order
     slot = order[place]
     own = A.P[slot]
     for i in range(place + 1, n):
@@ -297,39 +283,39 @@ def delete(A: WindowArrays, place: int, b: FloatArray) -> None:
     ``b`` is by position without the one that leaves, and becomes the row of the sample that `add` puts in its slot.
     COUNT is one less afterwards; `restore_factor` takes it back.
     """
-    n, N = A.C[COUNT], A.P.shape[0]
-    if A.C[LOGGED] == 0 or A.C[LOGGED] == KEPT_STEPS:
+    n, N = A.C[ws.COUNT], A.P.shape[0]
+    if A.C[ws.LOGGED] == 0 or A.C[ws.LOGGED] == ws.KEPT_STEPS:
         _keep(A)
-        A.C[LOGGED] = 0
-    record = _record(A, A.C[LOGGED])
+        A.C[ws.LOGGED] = 0
+    record = _record(A, A.C[ws.LOGGED])
     for i in range(n - 1):
         record[i] = b[i]
     record[N - 1] = place
-    A.C[LOGGED] += 1
+    A.C[ws.LOGGED] += 1
     _exchange(A, place, b)
-    A.C[COUNT] = n - 1
+    A.C[ws.COUNT] = n - 1
 
 
 @compiled_reassociating
 def add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
     """The sample of ``slot``, already written, is the last one; ``half`` is its row of L. COUNT is one more."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     A.P[slot, 0] = diagonal
     A.S[n] = (1.0 - dot(half, A.S, n)) / diagonal
-    A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
+    A.V[ws.SY, n] = (A.V[ws.Y, slot] - dot(half, A.V[ws.SY], n)) / diagonal
     A.order[n] = slot
-    A.C[COUNT] = n + 1
-    if A.C[LOGGED] > 0:
-        _record(A, A.C[LOGGED] - 1)[A.P.shape[0]] = diagonal
+    A.C[ws.COUNT] = n + 1
+    if A.C[ws.LOGGED] > 0:
+        _record(A, A.C[ws.LOGGED] - 1)[A.P.shape[0]] = diagonal
 
 
 @compiled_reassociating
 def append_row(A: WindowArrays, half: FloatArray) -> None:
     """Write ``half``, L^-1 of a new sample's column, as the next row of L; `add` follows. No copy is kept of this."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     for k in range(n):
         A.P[A.order[k], n - k] = half[k]
-    A.C[LOGGED] = 0
+    A.C[ws.LOGGED] = 0
 
 
 # --- The factor of before: a copy, and a record of each replacement since.
@@ -338,7 +324,7 @@ def append_row(A: WindowArrays, half: FloatArray) -> None:
 @compiled_reassociating
 def _keep(A: WindowArrays) -> None:
     """Copy the factor, packed column by column."""
-    n, at = A.C[COUNT], 0
+    n, at = A.C[ws.COUNT], 0
     for k in range(n):
         a, to = A.P[A.order[k]], A.kept[at : at + n - k]
         for i in range(to.shape[0]):
@@ -361,7 +347,7 @@ def restore_factor(A: WindowArrays) -> None:
 
     S and SY are spoilt. The next replacement begins with a new copy, so that it can be taken back at once.
     """
-    n, N, order, b, steps = A.C[COUNT], A.P.shape[0], A.order, A.V[TRIAL], A.C[LOGGED] - 1
+    n, N, order, b, steps = A.C[ws.COUNT], A.P.shape[0], A.order, A.V[ws.TRIAL], A.C[ws.LOGGED] - 1
     for back in range(steps + 1):
         place = int(_record(A, steps - back)[N - 1])
         slot = order[n - 1]
@@ -380,7 +366,7 @@ def restore_factor(A: WindowArrays) -> None:
             b[i] = record[i]
         _exchange(A, int(record[N - 1]), b)
         A.P[order[n - 1], 0] = record[N]
-    A.C[LOGGED] = 0
+    A.C[ws.LOGGED] = 0
 
 
 # --- The factor as a matrix.
@@ -389,104 +375,42 @@ def restore_factor(A: WindowArrays) -> None:
 @compiled_reassociating
 def take_upper(A: WindowArrays, upper: FloatArray) -> None:
     """The factor from the upper triangle of ``upper`` (N, N), L' by position."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     for k in range(n):
         row, a = upper[k], A.P[A.order[k]]
         for i in range(n - k):
             a[i] = row[k + i]
-    A.C[LOGGED] = 0
+    A.C[ws.LOGGED] = 0
 
 
 @compiled_reassociating
 def write_upper(A: WindowArrays, upper: FloatArray) -> None:
     """The factor into the upper triangle of ``upper`` (N, N), L' by position."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     for k in range(n):
         row, a = upper[k], A.P[A.order[k]]
         for i in range(n - k):
             row[k + i] = a[i]
 
 
-# --- The diagonal of R^-1 for leave-one-out, (Pc)_ii. From the factor alone it takes O(N³). Once known it follows a
-# step in O(N²), with the column c = R^-1 e_k of the sample k:
-#
-#     it leaves:  d_i <- d_i - c_i²/c_k  (c of the factor before),
-#     it comes:   d_i <- d_i + c_i²/c_k, d_k = c_k  (c of the factor after).
-#
-# Each such step also computes one element anew from the factor, in turn, so that no element is older than a round of
-# the window and errors do not add up. The diagonal is dropped when nobody has asked for it for a round.
+# --- The diagonal of R^-1 for leave-one-out.
 
 
 @compiled_reassociating
-def _half_column(A: WindowArrays, place: int, t: FloatArray) -> float:
-    """t <- L^-1 e_place, by position: zero above ``place``. Returns its square, the diagonal element of R^-1."""
-    n, total = A.C[COUNT], 0.0
-    for i in range(n):
-        t[i] = 0.0
-    t[place] = 1.0
-    for k in range(place, n):
-        column = A.P[A.order[k]]
-        half = t[k] / column[0]
-        t[k] = half
-        total += half * half
-        a, rest = column[1 : n - k], t[k + 1 : n]
-        for i in range(rest.shape[0]):
-            rest[i] -= a[i] * half
-    return total
-
-
-@compiled_reassociating
-def _column(A: WindowArrays, place: int, out: FloatArray) -> None:
-    """out <- R^-1 e, by slot, of the sample at ``place``."""
-    t = A.V[MINUS]
-    _half_column(A, place, t)
-    _backward_columns(A, A.C[COUNT], t)
-    for i in range(A.C[COUNT]):
-        out[A.order[i]] = t[i]
-
-
-@compiled_reassociating
-def before_leaving(A: WindowArrays, place: int) -> None:
-    """Before the sample at ``place`` leaves the factor: put its column of R^-1 into BITS."""
-    if A.C[CARRIED] > 0:
-        _column(A, place, A.V[BITS])
-
-
-@compiled_reassociating
-def after_leaving(A: WindowArrays, slot: int, n: int) -> None:
-    """Follow the diagonal after the sample of ``slot``, one of n, has left the factor."""
-    if A.C[CARRIED] > 0:
-        c, d = A.V[BITS], A.V[DIAGONAL]
-        own = c[slot]
-        for j in range(n):
-            d[j] -= c[j] * c[j] / own
-
-
-@compiled_reassociating
-def after_coming(A: WindowArrays, slot: int) -> None:
-    """Follow the diagonal after the sample of ``slot`` has come to the end of the factor; one element is made anew."""
-    n = A.C[COUNT]
-    if A.C[CARRIED] > 0:
-        A.C[CARRIED] -= 1
-        c, d = A.V[K], A.V[DIAGONAL]
-        _column(A, n - 1, c)
-        own = c[slot]
-        for j in range(n):
-            d[j] += c[j] * c[j] / own
-        d[slot] = own
-        turn = A.C[CURSOR] if A.C[CURSOR] < n else 0
-        for place in range(n):
-            if A.order[place] == turn:
-                d[turn] = _half_column(A, place, A.V[MINUS])
-
-
-@compiled_reassociating
-def diagonal(A: WindowArrays) -> FloatArray:
-    """The diagonal of R^-1 by slot; it is carried along for the next N steps. O(N³) where it is not known yet."""
-    n = A.C[COUNT]
-    d: FloatArray = A.V[DIAGONAL]
-    if A.C[CARRIED] == 0:
-        for place in range(n):
-            d[A.order[place]] = _half_column(A, place, A.V[MINUS])
-    A.C[CARRIED] = n
-    return d
+def diagonal(A: WindowArrays, out: FloatArray) -> None:
+    """out <- the diagonal of R^-1 by slot. O(N³): that of position i is the square of L^-1 e_i."""
+    n, t = A.C[ws.COUNT], A.V[ws.MINUS]
+    for place in range(n):
+        for i in range(n):
+            t[i] = 0.0
+        t[place] = 1.0
+        total = 0.0
+        for k in range(place, n):
+            column = A.P[A.order[k]]
+            half = t[k] / column[0]
+            t[k] = half
+            total += half * half
+            a, rest = column[1 : n - k], t[k + 1 : n]
+            for i in range(rest.shape[0]):
+                rest[i] -= a[i] * half
+        out[A.order[place]] = total

@@ -21,67 +21,10 @@ import numpy as np
 from dehyst.adaptive.compiled import compiled, compiled_reassociating, dot
 from dehyst.adaptive.kernels import rbf_column
 from dehyst.adaptive.types import FloatArray, IntArray
+from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import cholesky_form as cholesky
 from dehyst.adaptive.window import inverse_form as inverse
-from dehyst.adaptive.window.arrays import (
-    ACCEPTED,
-    ALPHA,
-    BAD_INPUT,
-    BAD_INPUTS,
-    BETA,
-    BITS,
-    CARRIED,
-    COLUMN,
-    CONTRACTION,
-    COUNT,
-    CURSOR,
-    FORM,
-    GAMMA,
-    GRAM,
-    ILL_CONDITIONED,
-    ILL_STEPS,
-    INVERSE_FORM,
-    LAST_WORST,
-    LEAST_PRECISION,
-    MINUS,
-    MOST,
-    MOST_PRECISION,
-    NEGLIGIBLE,
-    NO_SLOT,
-    PENDING,
-    PK,
-    PLUS,
-    REFINEMENTS,
-    RESIDUAL,
-    RESIDUALS_EXCEEDED,
-    ROUND_OFF,
-    ROUND_WORST,
-    ROUNDS,
-    SCHUR_SHARE,
-    STEPS,
-    SY,
-    TOLERANCE,
-    TRIAL,
-    UNDETERMINED,
-    UNDO,
-    UNDO_ALPHA,
-    UNDO_APPEND,
-    UNDO_NOTHING,
-    UNDO_POINT,
-    UNDO_R,
-    UNDO_REPLACE,
-    UNDO_S,
-    UNDO_SLOT,
-    UNDO_SY,
-    UNDO_W,
-    UNDO_Y,
-    K,
-    W,
-    WindowArrays,
-    Y,
-    Z,
-    arrays_of,
-)
+from dehyst.adaptive.window.arrays import WindowArrays, arrays_of
 
 # --- The kernel column of a point, and what the window predicts there.
 
@@ -91,15 +34,15 @@ def _kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
     """K, (2.31), of the samples in use with the point ``x`` (d,) into ``out`` (N,)."""
     for i in range(A.X.shape[0]):
         A.point[i] = x[i] * A.inverse_widths[i]
-    rbf_column(A.scaled, A.C[COUNT], A.point, out, A.V[BITS])
+    rbf_column(A.scaled, A.C[ws.COUNT], A.point, out, A.V[ws.BITS])
 
 
 @compiled_reassociating
 def predict(A: WindowArrays, x: FloatArray) -> float:
     """Mean at one point, (2.32). O(N d). Its scratch is the window's: one thread at a time."""
-    k = A.V[K]
+    k = A.V[ws.K]
     _kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
+    mean: float = dot(k, A.V[ws.ALPHA], A.C[ws.COUNT]) + A.F[ws.BETA]
     return mean
 
 
@@ -112,7 +55,7 @@ def predict_by_handle(handle: IntArray, x: FloatArray) -> float:  # pragma: no c
 @compiled_reassociating
 def nearest(A: WindowArrays, x: FloatArray) -> tuple[int, float]:
     """Slot of the sample with the largest kernel value to ``x`` (d,), and that value; (-1, 0) while it is empty."""
-    n, k = A.C[COUNT], A.V[K]
+    n, k = A.C[ws.COUNT], A.V[ws.K]
     _kernel_column(A, x, k)
     slot, most = -1, -1.0
     for j in range(n):
@@ -124,10 +67,10 @@ def nearest(A: WindowArrays, x: FloatArray) -> tuple[int, float]:
 @compiled_reassociating
 def scale(A: WindowArrays) -> float:
     """Variance of the kernel process by its likelihood, y'alpha/(N - 1): the unit of variances; 0 while N <= 1."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     if n <= 1:
         return 0.0
-    total: float = max(dot(A.V[Y], A.V[ALPHA], n), 0.0)
+    total: float = max(dot(A.V[ws.Y], A.V[ws.ALPHA], n), 0.0)
     degrees: float = n - 1
     return total / degrees
 
@@ -138,75 +81,75 @@ def scale(A: WindowArrays) -> float:
 @compiled_reassociating
 def _acceptable_weight(A: WindowArrays, w: float) -> bool:
     """True where double precision can tell the sample's noise variance 1/(gamma w) from the kernel."""
-    precision: float = A.F[GAMMA] * w
-    return precision >= LEAST_PRECISION and precision <= MOST_PRECISION
+    precision: float = A.F[ws.GAMMA] * w
+    return precision >= ws.LEAST_PRECISION and precision <= ws.MOST_PRECISION
 
 
 @compiled_reassociating
 def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
     """Features and target finite and at most MOST, a weight as above."""
-    good = abs(y) <= MOST and _acceptable_weight(A, w)
+    good = abs(y) <= ws.MOST and _acceptable_weight(A, w)
     for j in range(x.shape[0]):
-        good = good and abs(x[j]) <= MOST
+        good = good and abs(x[j]) <= ws.MOST
     return good
 
 
 @compiled_reassociating
 def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
     """Put a sample into a slot, and its kernel column (in COLUMN, but for the slot's own element) into R."""
-    column, row, n = A.V[COLUMN], A.R[slot], A.C[COUNT]
+    column, row, n = A.V[ws.COLUMN], A.R[slot], A.C[ws.COUNT]
     for j in range(n):
         row[j] = column[j]
         A.R[j, slot] = column[j]
-    A.R[slot, slot] = 1.0 + 1.0 / (A.F[GAMMA] * w)
+    A.R[slot, slot] = 1.0 + 1.0 / (A.F[ws.GAMMA] * w)
     for i in range(x.shape[0]):
         A.X[i, slot] = x[i]
         A.scaled[i, slot] = x[i] * A.inverse_widths[i]
-    A.V[Y, slot] = y
-    A.V[W, slot] = w
+    A.V[ws.Y, slot] = y
+    A.V[ws.W, slot] = w
 
 
 @compiled_reassociating
 def _keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
     """Copy into U what a step on ``slot`` overwrites, all but P."""
-    for j in range(A.C[COUNT]):
-        A.U[UNDO_S, j] = A.S[j]
-        A.U[UNDO_SY, j] = A.V[SY, j]
-        A.U[UNDO_ALPHA, j] = A.V[ALPHA, j]
-        A.U[UNDO_R, j] = A.R[slot, j]
-    A.U[UNDO_POINT, 0] = A.F[BETA]
+    for j in range(A.C[ws.COUNT]):
+        A.U[ws.UNDO_S, j] = A.S[j]
+        A.U[ws.UNDO_SY, j] = A.V[ws.SY, j]
+        A.U[ws.UNDO_ALPHA, j] = A.V[ws.ALPHA, j]
+        A.U[ws.UNDO_R, j] = A.R[slot, j]
+    A.U[ws.UNDO_POINT, 0] = A.F[ws.BETA]
     for i in range(A.X.shape[0]):
-        A.U[UNDO_POINT, 1 + i] = A.X[i, slot]
-    A.F[UNDO_Y] = A.V[Y, slot]
-    A.F[UNDO_W] = A.V[W, slot]
-    A.C[UNDO] = kind
-    A.C[UNDO_SLOT] = slot
+        A.U[ws.UNDO_POINT, 1 + i] = A.X[i, slot]
+    A.F[ws.UNDO_Y] = A.V[ws.Y, slot]
+    A.F[ws.UNDO_W] = A.V[ws.W, slot]
+    A.C[ws.UNDO] = kind
+    A.C[ws.UNDO_SLOT] = slot
 
 
 @compiled_reassociating
 def _restore_solution(A: WindowArrays) -> None:
     """S, Sy, bias and alpha as `_keep_for_undo` found them. Nothing is left to undo then."""
-    for j in range(A.C[COUNT]):
-        A.S[j] = A.U[UNDO_S, j]
-        A.V[SY, j] = A.U[UNDO_SY, j]
-        A.V[ALPHA, j] = A.U[UNDO_ALPHA, j]
-    A.F[BETA] = A.U[UNDO_POINT, 0]
+    for j in range(A.C[ws.COUNT]):
+        A.S[j] = A.U[ws.UNDO_S, j]
+        A.V[ws.SY, j] = A.U[ws.UNDO_SY, j]
+        A.V[ws.ALPHA, j] = A.U[ws.UNDO_ALPHA, j]
+    A.F[ws.BETA] = A.U[ws.UNDO_POINT, 0]
     _factor_gram(A)
-    A.C[UNDO] = UNDO_NOTHING
+    A.C[ws.UNDO] = ws.UNDO_NOTHING
 
 
 @compiled_reassociating
 def _restore_sample(A: WindowArrays) -> None:
     """The sample of the slot, and its row of R, as `_keep_for_undo` found them."""
-    slot = A.C[UNDO_SLOT]
-    for j in range(A.C[COUNT]):
-        A.R[slot, j] = A.U[UNDO_R, j]
-        A.R[j, slot] = A.U[UNDO_R, j]
+    slot = A.C[ws.UNDO_SLOT]
+    for j in range(A.C[ws.COUNT]):
+        A.R[slot, j] = A.U[ws.UNDO_R, j]
+        A.R[j, slot] = A.U[ws.UNDO_R, j]
     for i in range(A.X.shape[0]):
-        A.X[i, slot] = A.U[UNDO_POINT, 1 + i]
+        A.X[i, slot] = A.U[ws.UNDO_POINT, 1 + i]
         A.scaled[i, slot] = A.X[i, slot] * A.inverse_widths[i]
-    A.V[Y, slot] = A.F[UNDO_Y]
-    A.V[W, slot] = A.F[UNDO_W]
+    A.V[ws.Y, slot] = A.F[ws.UNDO_Y]
+    A.V[ws.W, slot] = A.F[ws.UNDO_W]
 
 
 # --- The solution (2.29) from S and Sy.
@@ -233,38 +176,38 @@ def _add_up(a: FloatArray, n: int) -> float:
 @compiled_reassociating
 def _factor_gram(A: WindowArrays) -> bool:
     """GRAM <- sqrt(1'P 1), 0 where that is not positive. False where it is not finite."""
-    n = A.C[COUNT]
-    gram = _add_up(A.S, n) if A.C[FORM] == INVERSE_FORM else dot(A.S, A.S, n)
-    A.F[GRAM] = np.sqrt(gram) if gram > 0.0 else 0.0
+    n = A.C[ws.COUNT]
+    gram = _add_up(A.S, n) if A.C[ws.FORM] == ws.INVERSE_FORM else dot(A.S, A.S, n)
+    A.F[ws.GRAM] = np.sqrt(gram) if gram > 0.0 else 0.0
     return bool(np.isfinite(gram))
 
 
 @compiled_reassociating
 def _solve_bias(A: WindowArrays, moment: float) -> float:
     """moment/(1'P 1): the bias for the moment 1'P y; 0 where no sample determines it."""
-    root = A.F[GRAM]
+    root = A.F[ws.GRAM]
     return moment / root / root if root > 0.0 else 0.0
 
 
 @compiled_reassociating
 def finish(A: WindowArrays) -> bool:
     """Bias and alpha from S and Sy, (2.29). False, with both spoilt, where they are not finite."""
-    n, sy, inverse_form = A.C[COUNT], A.V[SY], A.C[FORM] == INVERSE_FORM
+    n, sy, inverse_form = A.C[ws.COUNT], A.V[ws.SY], A.C[ws.FORM] == ws.INVERSE_FORM
     good = _factor_gram(A)
     moment = _add_up(sy, n) if inverse_form else dot(A.S, sy, n)
     # Before it is solved for: a vanishing 1'P 1 would hide it.
     good = good and bool(np.isfinite(moment))
-    A.F[BETA] = _solve_bias(A, moment)
-    rest = A.V[ALPHA] if inverse_form else A.V[Z]
+    A.F[ws.BETA] = _solve_bias(A, moment)
+    rest = A.V[ws.ALPHA] if inverse_form else A.V[ws.Z]
     for j in range(n):
         rest[j] = sy[j]
-    inverse.add_scaled(rest, -A.F[BETA], A.S, n)
-    good = good and bool(np.isfinite(A.F[BETA])) and finite(rest, n)
+    inverse.add_scaled(rest, -A.F[ws.BETA], A.S, n)
+    good = good and bool(np.isfinite(A.F[ws.BETA])) and finite(rest, n)
     if inverse_form:
         return good
     cholesky.backward(A, rest)
     for i in range(n):
-        A.V[ALPHA, A.order[i]] = rest[i]
+        A.V[ws.ALPHA, A.order[i]] = rest[i]
     return good and finite(rest, n)
 
 
@@ -280,38 +223,38 @@ def _scale_into(target: FloatArray, source: FloatArray, factor: float, n: int) -
 @compiled_reassociating
 def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
     """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     inverse.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
     A.S[slot] = 0.0
-    inverse.add_scaled(A.V[SY], -A.V[SY, slot] / p[slot], p, n)
-    A.V[SY, slot] = 0.0
+    inverse.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
+    A.V[ws.SY, slot] = 0.0
 
 
 @compiled_reassociating
 def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
-    n = A.C[COUNT]
+    n = A.C[ws.COUNT]
     inverse.add_scaled(A.S, _add_up(q, n) / s, q, n)
-    inverse.add_scaled(A.V[SY], dot(q, A.V[Y], n) / s, q, n)
+    inverse.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
 
 
 @compiled_reassociating
 def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    n = A.C[COUNT]
-    b, z, p, q = A.V[COLUMN], A.V[Z], A.V[PK], A.V[TRIAL]
+    n = A.C[ws.COUNT]
+    b, z, p, q = A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.PK], A.V[ws.TRIAL]
     b[slot] = 0.0
     inverse.multiply(A, b, z)
-    _keep_for_undo(A, slot, UNDO_REPLACE)
+    _keep_for_undo(A, slot, ws.UNDO_REPLACE)
     inverse.lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
         q[j] = z[j] - factor * p[j]
     q[slot] = 0.0
-    noise = 1.0 / (A.F[GAMMA] * w)
+    noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
     # What P gains and loses on its diagonal bounds what it does elsewhere.
-    good = pkk > 0.0 and s > SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
+    good = pkk > 0.0 and s > ws.SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
     if good:
         q[slot] = -1.0
         _take_out_inverse(A, slot, p)
@@ -323,43 +266,43 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
         _restore_solution(A)
         _restore_sample(A)
         inverse.lower_column(A, slot, p)
-        return ILL_CONDITIONED
-    _scale_into(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
-    A.V[MINUS, slot] = 0.0
-    _scale_into(A.V[PLUS], q, 1.0 / np.sqrt(s), n)
-    A.C[PENDING] = 1
-    return ACCEPTED
+        return ws.ILL_CONDITIONED
+    _scale_into(A.V[ws.MINUS], p, 1.0 / np.sqrt(pkk), n)
+    A.V[ws.MINUS, slot] = 0.0
+    _scale_into(A.V[ws.PLUS], q, 1.0 / np.sqrt(s), n)
+    A.C[ws.PENDING] = 1
+    return ws.ACCEPTED
 
 
 @compiled_reassociating
 def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    n = A.C[COUNT]
-    b, q = A.V[COLUMN], A.V[TRIAL]
+    n = A.C[ws.COUNT]
+    b, q = A.V[ws.COLUMN], A.V[ws.TRIAL]
     inverse.multiply(A, b, q)
-    noise = 1.0 / (A.F[GAMMA] * w)
+    noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
-    _keep_for_undo(A, n, UNDO_APPEND)
-    good = s > SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
+    _keep_for_undo(A, n, ws.UNDO_APPEND)
+    good = s > ws.SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
     if good:
         q[n] = -1.0
         A.S[n] = 0.0
-        A.V[SY, n] = 0.0
+        A.V[ws.SY, n] = 0.0
         for j in range(n + 1):
             A.P[n, j] = 0.0
         _write_sample(A, n, x, y, w)
-        A.C[COUNT] = n + 1
+        A.C[ws.COUNT] = n + 1
         _take_in_inverse(A, q, s)
         good = finish(A)
-        A.C[COUNT] = n
+        A.C[ws.COUNT] = n
     if not good:
         _restore_solution(A)
-        return ILL_CONDITIONED
-    A.C[COUNT] = n + 1
+        return ws.ILL_CONDITIONED
+    A.C[ws.COUNT] = n + 1
     for j in range(n + 1):
-        A.V[MINUS, j] = 0.0
-    _scale_into(A.V[PLUS], q, 1.0 / np.sqrt(s), n + 1)
-    A.C[PENDING] = 1
-    return ACCEPTED
+        A.V[ws.MINUS, j] = 0.0
+    _scale_into(A.V[ws.PLUS], q, 1.0 / np.sqrt(s), n + 1)
+    A.C[ws.PENDING] = 1
+    return ws.ACCEPTED
 
 
 # --- The same in the Cholesky form.
@@ -367,32 +310,29 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 @compiled_reassociating
 def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    n = A.C[COUNT]
-    column, half = A.V[COLUMN], A.V[TRIAL]
+    n = A.C[ws.COUNT]
+    column, half = A.V[ws.COLUMN], A.V[ws.TRIAL]
     place = cholesky.position_of(A, slot)
-    _keep_for_undo(A, slot, UNDO_REPLACE)
-    cholesky.before_leaving(A, place)
+    _keep_for_undo(A, slot, ws.UNDO_REPLACE)
     for i in range(place):
         half[i] = column[A.order[i]]
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
     cholesky.delete(A, place, half)
-    noise = 1.0 / (A.F[GAMMA] * w)
+    noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n - 1)
-    good = s > SCHUR_SHARE * noise
+    good = s > ws.SCHUR_SHARE * noise
     if good:
-        A.C[COUNT] = n
+        A.C[ws.COUNT] = n
         _write_sample(A, slot, x, y, w)
-        A.C[COUNT] = n - 1
+        A.C[ws.COUNT] = n - 1
         cholesky.add(A, slot, half, np.sqrt(s))
         good = finish(A)
     if not good:
-        A.C[COUNT] = n
+        A.C[ws.COUNT] = n
         _restore_replaced_cholesky(A)
-        return ILL_CONDITIONED
-    cholesky.after_leaving(A, slot, n)
-    cholesky.after_coming(A, slot)
-    return ACCEPTED
+        return ws.ILL_CONDITIONED
+    return ws.ACCEPTED
 
 
 @compiled_reassociating
@@ -405,23 +345,22 @@ def _restore_replaced_cholesky(A: WindowArrays) -> None:
 
 @compiled_reassociating
 def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    n = A.C[COUNT]
-    half = A.V[TRIAL]
-    cholesky.gather(A, A.V[COLUMN], half)
+    n = A.C[ws.COUNT]
+    half = A.V[ws.TRIAL]
+    cholesky.gather(A, A.V[ws.COLUMN], half)
     cholesky.forward(A, half)
-    noise = 1.0 / (A.F[GAMMA] * w)
+    noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n)
-    if not s > SCHUR_SHARE * noise:
-        return ILL_CONDITIONED
-    _keep_for_undo(A, n, UNDO_APPEND)
+    if not s > ws.SCHUR_SHARE * noise:
+        return ws.ILL_CONDITIONED
+    _keep_for_undo(A, n, ws.UNDO_APPEND)
     _write_sample(A, n, x, y, w)
     cholesky.append_row(A, half)
     cholesky.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)
-        return ILL_CONDITIONED
-    cholesky.after_coming(A, n)
-    return ACCEPTED
+        return ws.ILL_CONDITIONED
+    return ws.ACCEPTED
 
 
 # --- Checks: one row's residual after each step, and iterative refinement where it is too large.
@@ -430,8 +369,8 @@ def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 @compiled_reassociating
 def _row_residual(A: WindowArrays, i: int) -> float:
     """y_i - b - R_i alpha: zero but for the error of the recursion. In units of the target."""
-    fitted = dot(A.R[i], A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
-    residual: float = A.V[Y, i] - fitted
+    fitted = dot(A.R[i], A.V[ws.ALPHA], A.C[ws.COUNT]) + A.F[ws.BETA]
+    residual: float = A.V[ws.Y, i] - fitted
     return residual
 
 
@@ -444,56 +383,56 @@ def _rotate_residual(A: WindowArrays) -> bool:
     errors, rms(alpha)/gamma, and thereby the allowed relative error of alpha; the rounding of the scalar product
     itself is added.
     """
-    n = A.C[COUNT]
-    i = A.C[CURSOR]
+    n = A.C[ws.COUNT]
+    i = A.C[ws.CURSOR]
     if i >= n:
         i = 0
     residual = abs(_row_residual(A, i))
-    A.F[RESIDUAL] = residual
-    if not residual <= A.F[ROUND_WORST]:
-        A.F[ROUND_WORST] = residual
+    A.F[ws.RESIDUAL] = residual
+    if not residual <= A.F[ws.ROUND_WORST]:
+        A.F[ws.ROUND_WORST] = residual
     i += 1
     if i >= n:
         i = 0
-        A.F[LAST_WORST] = A.F[ROUND_WORST]
-        A.F[ROUND_WORST] = 0.0
-        A.C[ROUNDS] += 1
-    A.C[CURSOR] = i
-    length = np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
-    allowed = A.F[TOLERANCE] * length / (np.sqrt(n) * A.F[GAMMA])
-    good: bool = residual <= allowed + ROUND_OFF * (abs(A.V[Y, i]) + abs(A.F[BETA]) + length)
+        A.F[ws.LAST_WORST] = A.F[ws.ROUND_WORST]
+        A.F[ws.ROUND_WORST] = 0.0
+        A.C[ws.ROUNDS] += 1
+    A.C[ws.CURSOR] = i
+    length = np.sqrt(dot(A.V[ws.ALPHA], A.V[ws.ALPHA], n))
+    allowed = A.F[ws.TOLERANCE] * length / (np.sqrt(n) * A.F[ws.GAMMA])
+    good: bool = residual <= allowed + ws.ROUND_OFF * (abs(A.V[ws.Y, i]) + abs(A.F[ws.BETA]) + length)
     if not good:
-        A.C[RESIDUALS_EXCEEDED] += 1
+        A.C[ws.RESIDUALS_EXCEEDED] += 1
     return good
 
 
 @compiled_reassociating
 def resum(A: WindowArrays) -> bool:
     """S, Sy, bias and alpha anew from the inverse or factor as it stands. O(N²). False where they are not finite."""
-    n, ones = A.C[COUNT], A.V[COLUMN]
+    n, ones = A.C[ws.COUNT], A.V[ws.COLUMN]
     for j in range(n):
         ones[j] = 1.0
-    if A.C[FORM] == INVERSE_FORM:
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
         inverse.solve(A, ones, A.S)
-        inverse.solve(A, A.V[Y], A.V[SY])
+        inverse.solve(A, A.V[ws.Y], A.V[ws.SY])
     else:
         cholesky.gather(A, ones, A.S)
         cholesky.forward(A, A.S)
-        cholesky.gather(A, A.V[Y], A.V[SY])
-        cholesky.forward(A, A.V[SY])
+        cholesky.gather(A, A.V[ws.Y], A.V[ws.SY])
+        cholesky.forward(A, A.V[ws.SY])
     return finish(A)
 
 
 @compiled_reassociating
 def _refine_inverse(A: WindowArrays) -> bool:
     """One step of iterative refinement of S and Sy."""
-    n, residual, z, sy = A.C[COUNT], A.V[COLUMN], A.V[Z], A.V[SY]
+    n, residual, z, sy = A.C[ws.COUNT], A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.SY]
     for i in range(n):
         residual[i] = 1.0 - dot(A.R[i], A.S, n)
     inverse.solve(A, residual, z)
     inverse.add_scaled(A.S, 1.0, z, n)
     for i in range(n):
-        residual[i] = A.V[Y, i] - dot(A.R[i], sy, n)
+        residual[i] = A.V[ws.Y, i] - dot(A.R[i], sy, n)
     inverse.solve(A, residual, z)
     inverse.add_scaled(sy, 1.0, z, n)
     return finish(A)
@@ -502,24 +441,24 @@ def _refine_inverse(A: WindowArrays) -> bool:
 @compiled_reassociating
 def _refine_cholesky(A: WindowArrays) -> bool:
     """S and Sy anew, and one step of iterative refinement of bias and alpha."""
-    n, good, t = A.C[COUNT], resum(A), A.V[MINUS]
+    n, good, t = A.C[ws.COUNT], resum(A), A.V[ws.MINUS]
     for i in range(n):
         t[i] = _row_residual(A, A.order[i])
     cholesky.forward(A, t)
     correction = _solve_bias(A, dot(A.S, t, n))
     inverse.add_scaled(t, -correction, A.S, n)
-    A.F[BETA] += correction
+    A.F[ws.BETA] += correction
     cholesky.backward(A, t)
     for i in range(n):
-        A.V[ALPHA, A.order[i]] += t[i]
-    return good and bool(np.isfinite(A.F[BETA])) and finite(A.V[ALPHA], n)
+        A.V[ws.ALPHA, A.order[i]] += t[i]
+    return good and bool(np.isfinite(A.F[ws.BETA])) and finite(A.V[ws.ALPHA], n)
 
 
 @compiled_reassociating
 def refine(A: WindowArrays) -> bool:
     """One step of iterative refinement of bias and alpha with R, counted. O(N²). False where it left the finite."""
-    A.C[REFINEMENTS] += 1
-    if A.C[FORM] == INVERSE_FORM:
+    A.C[ws.REFINEMENTS] += 1
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
         return _refine_inverse(A)
     return _refine_cholesky(A)
 
@@ -531,36 +470,34 @@ def _refined(A: WindowArrays) -> bool:
     Refinement contracts by the error of P. Where it does not contract, the coming steps would diverge: the step is
     refused.
     """
-    row = A.C[CURSOR] - 1
+    row = A.C[ws.CURSOR] - 1
     if row < 0:
-        row = A.C[COUNT] - 1
-    before = A.F[RESIDUAL]
+        row = A.C[ws.COUNT] - 1
+    before = A.F[ws.RESIDUAL]
     good = refine(A)
-    n = A.C[COUNT]
-    size = abs(A.V[Y, row]) + abs(A.F[BETA]) + np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
-    return good and abs(_row_residual(A, row)) <= max(CONTRACTION * before, NEGLIGIBLE * size)
+    n = A.C[ws.COUNT]
+    size = abs(A.V[ws.Y, row]) + abs(A.F[ws.BETA]) + np.sqrt(dot(A.V[ws.ALPHA], A.V[ws.ALPHA], n))
+    return good and abs(_row_residual(A, row)) <= max(ws.CONTRACTION * before, ws.NEGLIGIBLE * size)
 
 
 @compiled_reassociating
 def take_back(A: WindowArrays) -> None:
     """Take back the last replacement or appended sample, which has just been made."""
-    kind, slot = A.C[UNDO], A.C[UNDO_SLOT]
-    if kind == UNDO_APPEND:
-        A.C[COUNT] -= 1
+    kind, slot = A.C[ws.UNDO], A.C[ws.UNDO_SLOT]
+    if kind == ws.UNDO_APPEND:
+        A.C[ws.COUNT] -= 1
         _restore_solution(A)
-    elif A.C[FORM] == INVERSE_FORM:
+    elif A.C[ws.FORM] == ws.INVERSE_FORM:
         _restore_solution(A)
         _restore_sample(A)
-        inverse.lower_column(A, slot, A.V[PK])
+        inverse.lower_column(A, slot, A.V[ws.PK])
     else:
         _restore_replaced_cholesky(A)
-    if A.C[FORM] == INVERSE_FORM:
-        for j in range(A.C[COUNT]):
-            A.V[MINUS, j] = 0.0
-            A.V[PLUS, j] = 0.0
-        A.C[PENDING] = 0
-    else:
-        A.C[CARRIED] = 0
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
+        for j in range(A.C[ws.COUNT]):
+            A.V[ws.MINUS, j] = 0.0
+            A.V[ws.PLUS, j] = 0.0
+        A.C[ws.PENDING] = 0
 
 
 @compiled_reassociating
@@ -569,16 +506,16 @@ def _checked(A: WindowArrays, status: int) -> int:
 
     A refused step is counted. Its row is checked again next time: the residual was that of a solution which is gone.
     """
-    if status == ACCEPTED:
-        residual, worst, last = A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST]
-        cursor, rounds = A.C[CURSOR], A.C[ROUNDS]
+    if status == ws.ACCEPTED:
+        residual, worst, last = A.F[ws.RESIDUAL], A.F[ws.ROUND_WORST], A.F[ws.LAST_WORST]
+        cursor, rounds = A.C[ws.CURSOR], A.C[ws.ROUNDS]
         if not _rotate_residual(A) and not _refined(A):
             take_back(A)
-            A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST] = residual, worst, last
-            A.C[CURSOR], A.C[ROUNDS] = cursor, rounds
-            status = ILL_CONDITIONED
-    if status == ILL_CONDITIONED:
-        A.C[ILL_STEPS] += 1
+            A.F[ws.RESIDUAL], A.F[ws.ROUND_WORST], A.F[ws.LAST_WORST] = residual, worst, last
+            A.C[ws.CURSOR], A.C[ws.ROUNDS] = cursor, rounds
+            status = ws.ILL_CONDITIONED
+    if status == ws.ILL_CONDITIONED:
+        A.C[ws.ILL_STEPS] += 1
     return status
 
 
@@ -592,16 +529,16 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
     Checks one rotating row's residual afterwards and refines where it exceeds the tolerance.
     """
     if not acceptable(A, x, y, w):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    if slot < 0 or slot >= A.C[COUNT]:
-        return NO_SLOT
-    _kernel_column(A, x, A.V[COLUMN])
-    if A.C[FORM] == INVERSE_FORM:
+        A.C[ws.BAD_INPUTS] += 1
+        return ws.BAD_INPUT
+    if slot < 0 or slot >= A.C[ws.COUNT]:
+        return ws.NO_SLOT
+    _kernel_column(A, x, A.V[ws.COLUMN])
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
         status = _checked(A, _replace_inverse(A, slot, x, y, w))
     else:
         status = _checked(A, _replace_cholesky(A, slot, x, y, w))
-    A.C[STEPS] += status == ACCEPTED
+    A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
 
 
@@ -609,35 +546,35 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
 def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     """One more slot, for (x, y) of noise weight w. O(N²)."""
     if not acceptable(A, x, y, w):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    if A.C[COUNT] >= A.P.shape[0]:
-        return NO_SLOT
-    _kernel_column(A, x, A.V[COLUMN])
-    if A.C[FORM] == INVERSE_FORM:
+        A.C[ws.BAD_INPUTS] += 1
+        return ws.BAD_INPUT
+    if A.C[ws.COUNT] >= A.P.shape[0]:
+        return ws.NO_SLOT
+    _kernel_column(A, x, A.V[ws.COLUMN])
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
         status = _checked(A, _append_inverse(A, x, y, w))
     else:
         status = _checked(A, _append_cholesky(A, x, y, w))
-    A.C[STEPS] += status == ACCEPTED
+    A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
 
 
 @compiled_reassociating
 def reweight(A: WindowArrays, slot: int, w: float) -> int:
     """Give the sample in ``slot`` the noise weight w: out and in again, which is exact for any change. O(N²)."""
-    if slot < 0 or slot >= A.C[COUNT]:
-        return NO_SLOT
+    if slot < 0 or slot >= A.C[ws.COUNT]:
+        return ws.NO_SLOT
     if not _acceptable_weight(A, w):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
+        A.C[ws.BAD_INPUTS] += 1
+        return ws.BAD_INPUT
     x = A.point
     for i in range(x.shape[0]):
         x[i] = A.X[i, slot]
-    for j in range(A.C[COUNT]):
-        A.V[COLUMN, j] = A.R[slot, j]
-    if A.C[FORM] == INVERSE_FORM:
-        return _checked(A, _replace_inverse(A, slot, x, A.V[Y, slot], w))
-    return _checked(A, _replace_cholesky(A, slot, x, A.V[Y, slot], w))
+    for j in range(A.C[ws.COUNT]):
+        A.V[ws.COLUMN, j] = A.R[slot, j]
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
+        return _checked(A, _replace_inverse(A, slot, x, A.V[ws.Y, slot], w))
+    return _checked(A, _replace_cholesky(A, slot, x, A.V[ws.Y, slot], w))
 
 
 # --- Leave-one-out.
@@ -647,27 +584,27 @@ def reweight(A: WindowArrays, slot: int, w: float) -> int:
 def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
     """Exact leave-one-out residuals alpha_i/(P_ii - S_i²/(1'S)) into ``out`` (N,); NaN for a single sample.
 
-    O(N) in the inverse form. In the Cholesky form O(N²) where the diagonal of P is carried along, else O(N³).
+    O(N) in the inverse form, O(N³) in the Cholesky form.
     """
-    n, root = A.C[COUNT], A.F[GRAM]
-    if A.C[FORM] == INVERSE_FORM:
+    n, root = A.C[ws.COUNT], A.F[ws.GRAM]
+    if A.C[ws.FORM] == ws.INVERSE_FORM:
         inverse.diagonal(A, out)
-        alpha, s = A.V[ALPHA], A.S
+        alpha, s = A.V[ws.ALPHA], A.S
         for i in range(n):
             half = s[i] / root if root > 0.0 else 0.0
             out[i] = _left_out(alpha[i], out[i], out[i] - half * half)
         return
-    known, t = cholesky.diagonal(A), A.V[TRIAL]
-    factor = 1.0 / root if root > 0.0 else 0.0
+    cholesky.diagonal(A, out)
+    t, factor = A.V[ws.TRIAL], 1.0 / root if root > 0.0 else 0.0
     for i in range(n):
         t[i] = factor * A.S[i]
     cholesky.backward(A, t)
     for i in range(n):
         slot = A.order[i]
-        out[slot] = _left_out(A.V[ALPHA, slot], known[slot], known[slot] - t[i] * t[i])
+        out[slot] = _left_out(A.V[ws.ALPHA, slot], out[slot], out[slot] - t[i] * t[i])
 
 
 @compiled_reassociating
 def _left_out(alpha: float, diagonal: float, without: float) -> float:
     """The leave-one-out residual alpha/without; NaN where the other samples do not determine the bias."""
-    return alpha / without if without > UNDETERMINED * diagonal else np.nan
+    return alpha / without if without > ws.UNDETERMINED * diagonal else np.nan

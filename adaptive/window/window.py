@@ -117,7 +117,7 @@ class SolverState:
         """Raise ValueError where counters or places would lead out of the arrays."""
         d, n = self.X.shape
         C = self.C.tolist()
-        places = (ws.COUNT, ws.UNDO_SLOT, ws.CURSOR, ws.UNDO_PLACE, ws.CARRIED)
+        places = (ws.COUNT, ws.UNDO_SLOT, ws.CURSOR, ws.UNDO_PLACE)
         if max(C[place] for place in places) > n:
             raise ValueError(f"C: got {C}, expected at most the window's {n} samples")
         if C[ws.COUNT] < 0 or not 0 <= C[ws.FORM] <= 1 or C[ws.CURSOR] < 0:
@@ -303,7 +303,7 @@ class Window:
         else:
             A.P[:] = P
         A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
-        A.C[ws.PENDING], A.C[ws.UNDO], A.C[ws.CARRIED] = 0, ws.UNDO_NOTHING, 0
+        A.C[ws.PENDING], A.C[ws.UNDO] = 0, ws.UNDO_NOTHING
         if not steps.resum(A):
             ws.take_over(A, before)
             raise NumericsError("window: its solution is not finite after a new factorisation; lower gamma")

@@ -24,7 +24,7 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from dehyst.baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from dehyst.baselines.common import FitReport, checked_recording, std_of_voltage
+from dehyst.baselines.common import FitReport, checked_recording
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])
@@ -109,7 +109,7 @@ class _Fit:
         return OptimizeResult(found, x=theta.copy())
 
 
-def _independent_samples(residual: FloatArray) -> float:
+def independent_samples(residual: FloatArray) -> float:
     """Number of independent samples in a residual, from its first autocorrelation.
 
     Model errors are not white: 10,000 samples of them may be worth ten.
@@ -151,7 +151,7 @@ def identify_bouc_wen(
         full = _Fit(u, y, dt, hold, free)
         best = full.solve(best.x, 25)
     without = full.solve(best.x, 25, inertia=False)
-    if (without.cost - best.cost) * _independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
+    if (without.cost - best.cost) * independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
         best = without
     residual, (d, offset, transient) = full.project(best.x)
     if not d > 0.0:
@@ -191,4 +191,4 @@ def fit_bouc_wen(
 ) -> tuple[BoucWenInverse, FitReport]:
     """Identify a Bouc-Wen stage with ``identify_bouc_wen`` and invert it; other arguments as in ``fit_linear``."""
     parameters, report = identify_bouc_wen(u_V, y_um, dt_s, hold=hold)
-    return BoucWenInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report
+    return BoucWenInverse.of(parameters, report, u_V, serve_dt_s)

@@ -24,17 +24,10 @@ import numpy as np
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import Entry, load, save
-from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
-from dehyst.baselines.common import (
-    Domain,
-    checked_memory,
-    checked_motion,
-    of_length,
-    positive,
-    std_or_nan,
-)
+from dehyst.baselines.common import BaselineInverse
 
 
 @dataclass(frozen=True)
@@ -211,8 +204,8 @@ def _track(u_V: FloatArray, shape: FloatArray, memory_V: FloatArray) -> None:
 
 
 @dataclass(frozen=True)
-class BoucWenInverse:
-    """Inverse of a Bouc-Wen stage; implements ``adaptive.types.InverseModel`` under the name ``bouc_wen``.
+class BoucWenInverse(BaselineInverse):
+    """Inverse of a Bouc-Wen stage.
 
     Under the zero-order hold the voltage acts half a sample after its instant on average. The inverse then looks half
     a sample ahead by the Taylor series of the motion, ``w(t + T/2)``. Under the linear hold the identification has put
@@ -223,15 +216,12 @@ class BoucWenInverse:
     """
 
     parameters: Annotated[BoucWenParameters, Entry("the identified stage", name="")]
-    dt_s: Annotated[float, Entry("sample time", "s")]
-    domain: Annotated[Domain, Entry("motion of the identification", name="")]
-    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
     name: Annotated[str, Entry("by which it is served", most=1000)] = "bouc_wen"
-    _constants: FloatArray = field(init=False, repr=False, compare=False)
+    #: (10,) what `run_inverse` takes: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max; read only.
+    constants: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        positive("dt_s", self.dt_s, "s")
-        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
+        super().__post_init__()
         p, domain = self.parameters, self.domain
         ahead = 0.5 * self.dt_s if p.hold == "zero_order" else 0.0
         constants = [
@@ -246,58 +236,17 @@ class BoucWenInverse:
             domain.y_max_um,
             domain.v_max_um_per_s,
         ]
-        object.__setattr__(self, "_constants", np.array(constants, dtype=np.float64))
-
-    @property
-    def constants(self) -> FloatArray:
-        """(10,) what `run_inverse` takes: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max; read only."""
-        return self._constants
+        object.__setattr__(self, "constants", np.array(constants, dtype=np.float64))
 
     @property
     def memory_size(self) -> int:
-        """2: last voltage and hysteresis, V."""
         return 2
 
-    def rest_memory(self, y_um: float) -> FloatArray:
-        """(u, g) V after a monotone motion from rest at 0 V to ``y_um`` µm."""
-        y, rest = np.array([float(y_um)]), np.zeros(1)
-        return self.feedforward(y, rest, rest, np.zeros(2)).memory
+    def _run(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        inside: BoolArray,
+    ) -> None:  # fmt: skip
+        run_inverse(y_um, v_um_per_s, a_um_per_s2, self.constants, memory, u_V, inside)
 
-    def feedforward(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
-    ) -> Feedforward:
-        """Voltages (n,) V for points (n,). Raises InputError on bad shapes."""
-        y, v, a = checked_motion(y_um, v_um_per_s, a_um_per_s2)
-        after = checked_memory(memory, 2)
-        u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
-        run_inverse(y, v, a, self._constants, after, u, inside)
-        std = np.empty(y.size)
-        std.fill(self.voltage_std_V)
-        return Feedforward(u, std, inside, after)
-
-    def track(
-        self,
-        y_um: FloatArray,
-        v_um_per_s: FloatArray,
-        a_um_per_s2: FloatArray,
-        u_V: FloatArray,
-        memory: FloatArray,
-    ) -> FloatArray:
-        """(u, g) after the voltages ``u_V`` (n,) were applied; values that are not finite are skipped."""
-        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
-        after = checked_memory(memory, 2)
-        _track(of_length("u_V", u_V, y.size), self.parameters.shape, after)
-        return after
-
-    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
+    def _drive(self, u_V: FloatArray, memory: FloatArray) -> None:
         _track(u_V, self.parameters.shape, memory)
-
-    def state_dict(self) -> StateDict:
-        """Flat numbers and vectors by name."""
-        return save(self)
-
-    @staticmethod
-    def from_state(state: StateDict) -> BoucWenInverse:
-        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
-        return load(BoucWenInverse, state)

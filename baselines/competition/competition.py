@@ -37,6 +37,7 @@ from dehyst.adaptive.types import (
 )
 from dehyst.baselines.bouc_wen.model import BoucWenInverse
 from dehyst.baselines.bouc_wen.online import BoucWenOnline
+from dehyst.baselines.common import BaselineInverse
 from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.baselines.competition.config import CompetitionConfig
 from dehyst.baselines.linear import LinearInverse, LinearOnline
@@ -62,8 +63,6 @@ _ONLINE_FORMS: Final[dict[type, Callable[[Any], OnlineModel]]] = {
     MpiInverse: MpiOnline,
     BoucWenInverse: BoucWenOnline,
 }
-#: Inverse models whose stated deviation is that of a fit, not of served answers.
-_BASELINES = (LinearInverse, MpiInverse, BoucWenInverse)
 
 
 def online_form(model: InverseModel) -> OnlineModel | None:
@@ -79,7 +78,7 @@ def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseMode
     calibrates its deviation on its own predictions and is returned unchanged. An ``rms_V`` of 0 means that nothing
     has been scored yet; the model is then returned unchanged too.
     """
-    if not isinstance(model, _BASELINES) or not 0.0 < rms_V < math.inf:
+    if not isinstance(model, BaselineInverse) or not 0.0 < rms_V < math.inf:
         return model
     return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
 

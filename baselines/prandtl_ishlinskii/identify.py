@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
-from dehyst.baselines.common import FitReport, checked_recording, std_of_voltage
+from dehyst.baselines.common import FitReport, checked_recording
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, from_inverse_saturation
 from dehyst.baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
 
@@ -180,4 +180,4 @@ def fit_mpi(
 ) -> tuple[MpiInverse, FitReport]:
     """Identify an MPI model with ``identify_mpi`` and invert it; other arguments as in ``fit_linear``."""
     parameters, report = identify_mpi(u_V, y_um, dt_s, fit_lag=fit_lag)
-    return MpiInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report
+    return MpiInverse.of(parameters, report, u_V, serve_dt_s)

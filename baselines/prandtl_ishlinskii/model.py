@@ -22,16 +22,9 @@ import numpy as np
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import Entry, load, save
-from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from dehyst.baselines.common import (
-    Domain,
-    checked_memory,
-    checked_motion,
-    of_length,
-    positive,
-    std_or_nan,
-)
+from dehyst.adaptive.state import Entry
+from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.baselines.common import BaselineInverse
 from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
 
 
@@ -243,26 +236,20 @@ def _track(u_V: FloatArray, r_V: FloatArray, memory_V: FloatArray) -> None:
 
 
 @dataclass(frozen=True)
-class MpiInverse:
-    """Exact inverse of an MPI model; implements ``adaptive.types.InverseModel`` under the name ``mpi``.
+class MpiInverse(BaselineInverse):
+    """Exact inverse of an MPI model. The memory holds the states of the forward plays, V.
 
-    The memory holds the states of the forward plays, V. Only the voltage drives them, so ``track`` uses the applied
-    voltages, which carry no sensor noise, and ignores the measured motion. After voltages that this model gave,
-    ``track`` and ``feedforward`` agree on the memory to round-off. ``voltage_std_V``: NaN where it is unknown.
+    After voltages that this model gave, ``track`` and ``feedforward`` agree on the memory to round-off.
     """
 
     parameters: Annotated[MpiParameters, Entry("the identified stage", name="")]
-    dt_s: Annotated[float, Entry("sample time", "s")]
-    domain: Annotated[Domain, Entry("motion of the identification", name="")]
-    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
     name: Annotated[str, Entry("by which it is served", most=1000)] = "mpi"
     _plays: FloatArray = field(init=False, repr=False, compare=False)
     _saturation: FloatArray = field(init=False, repr=False, compare=False)
     _scalars: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        positive("dt_s", self.dt_s, "s")
-        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
+        super().__post_init__()
         p, domain = self.parameters, self.domain
         w_h, w_s = p.w_h_, p.w_s_
         plays = np.stack([w_h, np.cumsum(w_h), inverse_thresholds(w_h, p.r_), inverse_weights(w_h)])
@@ -276,49 +263,16 @@ class MpiInverse:
 
     @property
     def memory_size(self) -> int:
-        """One state per play, V."""
         return int(self._plays.shape[1])
 
-    def rest_memory(self, y_um: float) -> FloatArray:
-        """Play states (n+1,) V after a monotone motion from rest at 0 V to ``y_um`` µm."""
-        y, rest = np.array([float(y_um)]), np.zeros(1)
-        return self.feedforward(y, rest, rest, self.parameters.start()).memory
+    def _start(self) -> FloatArray:
+        return self.parameters.start()
 
-    def feedforward(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
-    ) -> Feedforward:
-        """Voltages (n,) V for displacements (n,) µm. Raises InputError on bad shapes."""
-        y, v, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
-        after = checked_memory(memory, self._plays.shape[1])
-        u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
-        run_inverse(y, v, self._plays, self._saturation, self._scalars, after, u, inside)
-        std = np.empty(y.size)
-        std.fill(self.voltage_std_V)
-        return Feedforward(u, std, inside, after)
+    def _run(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        inside: BoolArray,
+    ) -> None:  # fmt: skip
+        run_inverse(y_um, v_um_per_s, self._plays, self._saturation, self._scalars, memory, u_V, inside)
 
-    def track(
-        self,
-        y_um: FloatArray,
-        v_um_per_s: FloatArray,
-        a_um_per_s2: FloatArray,
-        u_V: FloatArray,
-        memory: FloatArray,
-    ) -> FloatArray:
-        """Play states after the voltages ``u_V`` (n,) were applied; values that are not finite are skipped."""
-        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
-        after = checked_memory(memory, self._plays.shape[1])
-        _track(of_length("u_V", u_V, y.size), self.parameters.r_, after)
-        return after
-
-    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
+    def _drive(self, u_V: FloatArray, memory: FloatArray) -> None:
         _track(u_V, self.parameters.r_, memory)
-
-    def state_dict(self) -> StateDict:
-        """Flat numbers and vectors by name."""
-        return save(self)
-
-    @staticmethod
-    def from_state(state: StateDict) -> MpiInverse:
-        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
-        return load(MpiInverse, state)

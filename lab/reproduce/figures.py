@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ from dehyst.sim.chapter.modelling import ForwardRun
 # Figs. 2.2, 2.3, 2.8 to 2.15: the stage's loops, and the forward models on training and test records.
 
 
-def figure_2_2(path: Path, name: str, found: Characterisation) -> Path:
+def figure_2_2(path: Path, title: str, found: Characterisation) -> Path:
     """Triangles of growing amplitude: input, displacements, loops, and the loop's width against amplitude."""
-    drawn, axes = figure(2, 2, (10, 7), f"Fig. 2.2 on the stage {name!r}: triangles of growing amplitude")
+    drawn, axes = figure(2, 2, (10, 7), title)
     run, other = found.triangles, found.second_axis
     line(axes[0, 0], run.t_s, run.u_V, color="black")
     label(axes[0, 0], "time / s", "voltage / V", "a  input")
@@ -39,9 +40,9 @@ def figure_2_2(path: Path, name: str, found: Characterisation) -> Path:
     return save(drawn, path)
 
 
-def figure_2_3(path: Path, name: str, found: Characterisation) -> Path:
+def figure_2_3(path: Path, title: str, found: Characterisation) -> Path:
     """Sines of 1 to 10 Hz: displacement, loops, and the loop's width against frequency."""
-    drawn, axes = figure(2, 2, (10, 7), f"Fig. 2.3 on the stage {name!r}: sines of one amplitude, 1 to 10 Hz")
+    drawn, axes = figure(2, 2, (10, 7), title)
     shades = [0.75 - 0.75 * i / (len(found.sines) - 1) for i in range(len(found.sines))]
     for run, shade, width in zip(found.sines, shades, found.sine_widths, strict=True):
         style = {"color": (0.9 * (1 - shade), 0.4, shade), "lw": 0.6}
@@ -66,70 +67,71 @@ def _widths(axis: Any, widths: tuple[Width, ...], at: list[float], title: str) -
     label(axis, title, "loop width", "d  width at one voltage")
 
 
+#: A curve: x, y, and its style. A panel: its curves, the label of its y axis, and its title.
+Curve = tuple[FloatArray, FloatArray, dict[str, Any]]
+Panel = tuple[list[Curve], str, str]
+
+
+def stacked(path: Path, title: str, panels: list[Panel], size: tuple[float, float] = (9, 6), **options: Any) -> Path:
+    """Panels below each other over time, each with a legend where its curves have labels."""
+    drawn, axes = figure(len(panels), 1, size, title, sharex=True, **options)
+    for axis, (curves, y_label, text) in zip(axes[:, 0], panels, strict=True):
+        for x, y, style in curves:
+            line(axis, x, y, **style)
+        if any("label" in style for _, _, style in curves):
+            legend(axis)
+        label(axis, "", y_label, text)
+    axes[-1, 0].set_xlabel("time / s", fontsize=9)
+    return save(drawn, path)
+
+
 def record_figure(path: Path, title: str, record: Record) -> Path:
     """Figs. 2.8 and 2.13: an input and the response of the stage."""
-    drawn, axes = figure(2, 1, (9, 5.5), title, sharex=True)
-    line(axes[0, 0], record.t_s, record.u_V, color="black")
-    line(axes[1, 0], record.t_s, record.y_um, color="black")
-    label(axes[0, 0], "", "voltage / V", "a  input")
-    label(axes[1, 0], "time / s", "displacement / µm", "b  output")
-    return save(drawn, path)
+    black = {"color": "black"}
+    above: Panel = ([(record.t_s, record.u_V, black)], "voltage / V", "a  input")
+    return stacked(path, title, [above, ([(record.t_s, record.y_um, black)], "displacement / µm", "b  output")])
 
 
 def result_figure(path: Path, title: str, record: Record, runs: list[ForwardRun]) -> Path:
     """Figs. 2.9, 2.10, 2.12: measured and modelled displacement on the training record, and the errors."""
-    drawn, axes = figure(2, 1, (9, 6), title, sharex=True)
     t_s, y_um = record.coarse_t_s, record.coarse_y_um
-    axes[0, 0].plot(t_s, y_um, color="black", lw=1.0, label="stage")
+    models: list[Curve] = [(t_s, y_um, {"color": "black", "lw": 1.0, "label": "stage"})]
+    errors: list[Curve] = []
     for run, dash in zip(runs, ("-", "--", ":"), strict=False):
-        style = {
-            "color": model_colour(run.key),
-            "ls": dash,
-            "lw": 0.9,
-            "label": f"{run.label}, {run.route}",
-        }
-        axes[0, 0].plot(t_s, run.training_um, **style)
-        axes[1, 0].plot(t_s, y_um - run.training_um, **style)
-    legend(axes[0, 0])
-    label(axes[0, 0], "", "displacement / µm", "a  stage and model")
+        style = {"color": model_colour(run.key), "ls": dash}
+        models.append((t_s, run.training_um, {**style, "label": f"{run.label}, {run.route}"}))
+        errors.append((t_s, y_um - run.training_um, style))
     worst = ", ".join(f"{run.training.max_um:.2f} µm" for run in runs)
-    label(axes[1, 0], "time / s", "error / µm", f"b  stage less model (largest {worst})")
-    return save(drawn, path)
+    below: Panel = (errors, "error / µm", f"b  stage less model (largest {worst})")
+    return stacked(path, title, [(models, "displacement / µm", "a  stage and model"), below])
 
 
-def figure_2_11(path: Path, name: str, record: Record) -> Path:
+def figure_2_11(path: Path, title: str, record: Record) -> Path:
     """The two inputs of the chapter's LSSVM."""
-    drawn, axes = figure(2, 1, (9, 5.5), f"Fig. 2.11 on the stage {name!r}: inputs of the LSSVM", sharex=True)
-    rows = two_inputs(record.coarse_u_V)
-    axes[0, 0].plot(record.coarse_t_s, rows[:, 0], color="black", lw=0.9)
-    axes[1, 0].plot(record.coarse_t_s, rows[:, 1], color="black", lw=0.9)
-    label(axes[0, 0], "", "u / V", "a  voltage")
-    label(axes[1, 0], "time / s", "du/dt / V/s", "b  its backward difference (2.41)")
-    return save(drawn, path)
+    u_V, rate = two_inputs(record.coarse_u_V).T
+    black = {"color": "black"}
+    above: Panel = ([(record.coarse_t_s, u_V, black)], "u / V", "a  voltage")
+    below: Panel = ([(record.coarse_t_s, rate, black)], "du/dt / V/s", "b  its backward difference (2.41)")
+    return stacked(path, title, [above, below])
 
 
-def figure_2_14(path: Path, name: str, record: Record, runs: list[ForwardRun]) -> Path:
+def figure_2_14(path: Path, title: str, record: Record, runs: list[ForwardRun]) -> Path:
     """Generalisation: each model's output beside the stage."""
-    drawn, axes = figure(len(runs), 1, (9, 2.1 * len(runs)), f"Fig. 2.14 on the stage {name!r}: (2.45)", sharex=True)
-    for axis, run in zip(axes[:, 0], runs, strict=True):
-        axis.plot(record.coarse_t_s, record.coarse_y_um, color="black", lw=1.0, label="stage")
-        axis.plot(record.coarse_t_s, run.generalisation_um, color=model_colour(run.key), lw=0.9, label=run.label)
-        legend(axis, loc="upper right")
-        label(axis, "", "µm")
-    label(axes[-1, 0], "time / s", "µm")
-    return save(drawn, path)
-
-
-def figure_2_15(path: Path, name: str, record: Record, runs: list[ForwardRun]) -> Path:
-    """Generalisation: errors of the models, on one scale."""
-    drawn, axes = figure(1, 1, (9, 4), f"Fig. 2.15 on the stage {name!r}: errors on (2.45)")
+    stage: Curve = (record.coarse_t_s, record.coarse_y_um, {"color": "black", "lw": 1.0, "label": "stage"})
+    panels: list[Panel] = []
     for run in runs:
-        error: FloatArray = record.coarse_y_um - run.generalisation_um
-        text = f"{run.label}: MAE {run.generalisation.mae_pct:.3f} %"
-        axes[0, 0].plot(record.coarse_t_s, error, color=model_colour(run.key), lw=0.9, label=text)
-    legend(axes[0, 0])
-    label(axes[0, 0], "time / s", "stage less model / µm")
-    return save(drawn, path)
+        style = {"color": model_colour(run.key), "label": run.label}
+        panels.append(([stage, (record.coarse_t_s, run.generalisation_um, style)], "µm", ""))
+    return stacked(path, title, panels, (9, 2.1 * len(runs)))
+
+
+def figure_2_15(path: Path, title: str, record: Record, runs: list[ForwardRun]) -> Path:
+    """Generalisation: errors of the models, on one scale."""
+    curves: list[Curve] = []
+    for run in runs:
+        style = {"color": model_colour(run.key), "label": f"{run.label}: MAE {run.generalisation.mae_pct:.3f} %"}
+        curves.append((record.coarse_t_s, record.coarse_y_um - run.generalisation_um, style))
+    return stacked(path, title, [(curves, "stage less model / µm", "")], (9, 4))
 
 
 def third_figure(path: Path, name: str, runs: list[ForwardRun]) -> Path:
@@ -151,32 +153,29 @@ def third_figure(path: Path, name: str, runs: list[ForwardRun]) -> Path:
 
 def draw_models(folder: Path, study: PresetStudy) -> dict[str, Path]:
     """Draw the figures of characterisation and forward models into ``folder``; figure -> file."""
-    name, data = study.name, study.data
-    keys = {run.key for run in study.forward}
+    name, train, test = study.name, study.data.training, study.data.generalisation
+
+    def at(key: str, what: str) -> tuple[Path, str]:
+        return folder / f"figure_2_{key[2:].zfill(2)}.png", f"Fig. {key} on the stage {name!r}: {what}"
 
     def runs(*wanted: str) -> list[ForwardRun]:
-        return [study.model(key) for key in wanted if key in keys]
+        return [run for key in wanted for run in study.forward if run.key == key]
 
     compared = runs("bouc_wen", "mpi", "lssvm", "lssvm_memory")
-    on = f"on the stage {name!r}"
-    train, test = data.training, data.generalisation
+    results = {
+        "2.9": ("Bouc-Wen", "bouc_wen", "bouc_wen_pso"),
+        "2.10": ("MPI", "mpi", "mpi_pso", "mpi_lag"),
+        "2.12": ("LSSVM", "lssvm", "lssvm_memory"),
+    }
     return {
-        "2.2": figure_2_2(folder / "figure_2_02.png", name, study.characterisation),
-        "2.3": figure_2_3(folder / "figure_2_03.png", name, study.characterisation),
-        "2.8": record_figure(folder / "figure_2_08.png", f"Fig. 2.8 {on}: training data (2.37)", train),
-        "2.9": result_figure(
-            folder / "figure_2_09.png", f"Fig. 2.9 {on}: Bouc-Wen", train, runs("bouc_wen", "bouc_wen_pso")
-        ),
-        "2.10": result_figure(
-            folder / "figure_2_10.png", f"Fig. 2.10 {on}: MPI", train, runs("mpi", "mpi_pso", "mpi_lag")
-        ),
-        "2.11": figure_2_11(folder / "figure_2_11.png", name, train),
-        "2.12": result_figure(
-            folder / "figure_2_12.png", f"Fig. 2.12 {on}: LSSVM", train, runs("lssvm", "lssvm_memory")
-        ),
-        "2.13": record_figure(folder / "figure_2_13.png", f"Fig. 2.13 {on}: test data (2.45)", test),
-        "2.14": figure_2_14(folder / "figure_2_14.png", name, test, compared),
-        "2.15": figure_2_15(folder / "figure_2_15.png", name, test, compared),
+        "2.2": figure_2_2(*at("2.2", "triangles of growing amplitude"), study.characterisation),
+        "2.3": figure_2_3(*at("2.3", "sines of one amplitude, 1 to 10 Hz"), study.characterisation),
+        "2.8": record_figure(*at("2.8", "training data (2.37)"), train),
+        **{key: result_figure(*at(key, what), train, runs(*keys)) for key, (what, *keys) in results.items()},
+        "2.11": figure_2_11(*at("2.11", "inputs of the LSSVM"), train),
+        "2.13": record_figure(*at("2.13", "test data (2.45)"), test),
+        "2.14": figure_2_14(*at("2.14", "models on (2.45)"), test, compared),
+        "2.15": figure_2_15(*at("2.15", "errors on (2.45)"), test, compared),
         "third": third_figure(
             folder / "third_family.png", name, runs("bouc_wen", "mpi", "mpi_lag", "lssvm", "lssvm_memory")
         ),
@@ -191,58 +190,34 @@ LABELS = {"none": "no model", **FROZEN, **{key: text for key, (text, _) in LEARN
 COMPARED = ("bouc_wen", "mpi", "lssvm", "lssvm_memory", "lssvm_adaptive")
 
 
-def followed(path: Path, title: str, loops: list[Loop], names: list[str]) -> Path:
-    """Reference and displacements above, errors of every run on one scale below."""
-    drawn, axes = figure(2, 1, (9, 6.5), title, sharex=True, height_ratios=(1, 1.4))
-    first = loops[0].run
-    line(axes[0, 0], first.t_s, first.reference_um, color=REFERENCE, label="reference")
-    for loop, name in zip(loops, names, strict=True):
-        run, learns = loop.run, loop.model in LEARNING
-        style = {"color": model_colour(loop.model), "ls": "--" if learns else "-", "lw": 0.7}
-        line(axes[0, 0], run.t_s, run.y_um, **style)
-        line(axes[1, 0], run.t_s, run.error_um, label=f"{name}: MAE {loop.score.mae_pct:.4f} %", **style)
-    legend(axes[1, 0])
-    label(axes[0, 0], "", "displacement / µm", "a  reference and displacement")
-    label(axes[1, 0], "time / s", "error / µm", "b  reference less displacement")
-    return save(drawn, path)
+def followed(path: Path, title: str, loops: dict[str, Loop], colours: Sequence[str]) -> Path:
+    """Reference and displacements above, errors of every run, by its name, on one scale below."""
+    first = next(iter(loops.values())).run
+    above: list[Curve] = [(first.t_s, first.reference_um, {"color": REFERENCE})]
+    below: list[Curve] = []
+    for (name, loop), colour in zip(loops.items(), colours, strict=False):
+        style = {"color": colour, "ls": "--" if loop.model in LEARNING else "-", "lw": 0.7}
+        above.append((first.t_s, loop.run.y_um, style))
+        below.append((first.t_s, loop.run.error_um, {**style, "label": f"{name}: MAE {loop.score.mae_pct:.4f} %"}))
+    panels: list[Panel] = [(above, "displacement / µm", "a  reference and displacement")]
+    return stacked(path, title, [*panels, (below, "error / µm", "b  reference less displacement")], (9, 6.5))
 
 
-def figure_2_19(path: Path, name: str, control: Control, model: str, reference: str) -> Path:
-    """FF, FB and FF+FB with one model."""
-    loops = [
-        control.loop(model, "FF", reference),
-        control.loop("none", "FB", reference),
-        control.loop(model, "FF+FB", reference),
-    ]
-    drawn, axes = figure(2, 1, (9, 6.5), f"Fig. 2.19 on the stage {name!r}: {LABELS[model]}", sharex=True)
-    shades = SERIES[:3]
-    line(axes[0, 0], loops[0].run.t_s, loops[0].run.reference_um, color=REFERENCE, label="reference")
-    for loop, shade in zip(loops, shades, strict=True):
-        text = f"{loop.controller}: MAE {loop.score.mae_pct:.4f} %"
-        line(axes[0, 0], loop.run.t_s, loop.run.y_um, color=shade, lw=0.7)
-        line(axes[1, 0], loop.run.t_s, loop.run.error_um, color=shade, lw=0.7, label=text)
-    legend(axes[1, 0])
-    label(axes[0, 0], "", "displacement / µm", "a  results")
-    label(axes[1, 0], "time / s", "error / µm", "b  errors")
-    return save(drawn, path)
-
-
-def figure_2_20(path: Path, name: str, control: Control, model: str, reference: str) -> Path:
-    """Actual against wanted displacement, and the two parts of the control signal."""
-    drawn, axes = figure(1, 2, (10, 4.5), f"Fig. 2.20 on the stage {name!r}: {LABELS[model]}")
-    shades = dict(zip(("FF", "FB", "FF+FB"), SERIES, strict=False))
-    for controller, shade in shades.items():
-        run = control.loop("none" if controller == "FB" else model, controller, reference).run
+def figure_2_20(path: Path, title: str, loops: dict[str, Loop]) -> Path:
+    """Actual against wanted displacement of FF, FB and FF+FB, and the two parts of the last one's control signal."""
+    drawn, axes = figure(1, 2, (10, 4.5), title)
+    for (controller, loop), shade in zip(loops.items(), SERIES, strict=False):
+        run = loop.run
         # the error is drawn, since at this scale the curves themselves are one line
         line(axes[0, 0], run.reference_um, run.y_um - run.reference_um, color=shade, lw=0.5, label=controller)
-    legend(axes[0, 0])
     label(axes[0, 0], "reference / µm", "actual less reference / µm", "a  actual against reference")
-    run = control.loop(model, "FF+FB", reference).run
+    run = loops["FF+FB"].run
     line(axes[0, 1], run.t_s, run.u_V, color="black", label="whole")
     line(axes[0, 1], run.t_s, run.feedforward_V, color=SERIES[0], ls="--", label="feedforward")
     line(axes[0, 1], run.t_s, run.feedback_V, color=SERIES[1], label="feedback")
-    legend(axes[0, 1])
     label(axes[0, 1], "time / s", "voltage / V", "b  parts of the control signal, FF+FB")
+    for axis in axes[0]:
+        legend(axis)
     return save(drawn, path)
 
 
@@ -273,15 +248,17 @@ def draw_control(folder: Path, study: PresetStudy) -> dict[str, Path]:
     """Draw the figures of control into ``folder``; figure -> file."""
     name, control = study.name, study.control
     first = control.loops[0].reference
-    names = [LABELS[key] for key in COMPARED]
-    forward = [control.loop(key, "FF", first) for key in COMPARED]
-    hybrid = [control.loop(key, "FF+FB", first) for key in COMPARED]
+    forward, hybrid = (
+        {LABELS[key]: control.loop(key, controller, first) for key in COMPARED} for controller in ("FF", "FF+FB")
+    )
+    colours, model = [model_colour(key) for key in COMPARED], "lssvm_memory"
+    parts = {c: control.loop("none" if c == "FB" else model, c, first) for c in ("FF", "FB", "FF+FB")}
     on = f"on the stage {name!r}"
     return {
-        "2.17": followed(folder / "figure_2_17.png", f"Fig. 2.17 {on}: feedforward alone", forward, names),
-        "2.18": followed(folder / "figure_2_18.png", f"Fig. 2.18 {on}: feedforward and feedback", hybrid, names),
-        "2.19": figure_2_19(folder / "figure_2_19.png", name, control, "lssvm_memory", first),
-        "2.20": figure_2_20(folder / "figure_2_20.png", name, control, "lssvm_memory", first),
+        "2.17": followed(folder / "figure_2_17.png", f"Fig. 2.17 {on}: feedforward alone", forward, colours),
+        "2.18": followed(folder / "figure_2_18.png", f"Fig. 2.18 {on}: feedforward and feedback", hybrid, colours),
+        "2.19": followed(folder / "figure_2_19.png", f"Fig. 2.19 {on}: {LABELS[model]}", parts, SERIES),
+        "2.20": figure_2_20(folder / "figure_2_20.png", f"Fig. 2.20 {on}: {LABELS[model]}", parts),
         "change": change_figure(folder / "gain_change.png", name, control),
     }
 
@@ -311,7 +288,7 @@ def stack_figure(path: Path, found: Stack) -> Path:
     models = [model for model in found.models if not model.failed]
     at = np.arange(len(models))
     for i, name in enumerate(WINDOWS):
-        axes[2, 0].bar(at + 0.4 * (i - 0.5), [m.windows_um[name] for m in models], 0.38, label=f"window: {name}")
+        axes[2, 0].bar(at + 0.4 * (i - 0.5), [m.windows_rmse_um[name] for m in models], 0.38, label=f"window: {name}")
     for (start, stop, value), dash in zip(WINDOWS.values(), ("--", ":"), strict=True):
         text = f"published, rows {start} to {stop - 1}: {value} µm"
         axes[2, 0].axhline(value, color="black", ls=dash, lw=1.0, label=text)

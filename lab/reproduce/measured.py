@@ -55,15 +55,15 @@ def data_folder() -> Path:
 class StackModel:
     """A model's equivalent displacement errors on the stack's test recording, RMSE in µm.
 
-    whole : all of it. windows : by name, mean removed, as the authors' figures are.
+    whole_... : all of it. windows_... : by name, mean removed, as the authors' figures are. failed : why, or None.
     """
 
     name: str
     seconds: float
-    whole_um: float
-    whole_pct: float
-    windows_um: dict[str, float]
-    failed: str
+    whole_rmse_um: float
+    whole_rmse_pct: float
+    windows_rmse_um: dict[str, float]
+    failed: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None
             continue
         windows = {name: _centred_rmse(error[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
         whole = result.score.rmse_um
-        models.append(StackModel(result.name, result.seconds, whole, 100.0 * whole / range_um, windows, ""))
+        models.append(StackModel(result.name, result.seconds, whole, 100.0 * whole / range_um, windows, None))
     y = recording.y_um
     reproduced = {name: _centred_rmse(y[start:stop] - wanted[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
     return Stack(
@@ -157,8 +157,8 @@ def _learning(
 class Benchmark:
     """The Bouc-Wen benchmark: model, its report, and forward prediction of the test multisine, m.
 
-    ``rmse_m``, ``max_m`` : of the prediction with 20 steps a sample; ``finer_m`` : RMSE with 40; ``held_m`` : RMSE
-    with the force held between samples, which shows the effect of a band-limited input. ``test_rms_m`` : of the test
+    ``rmse_m``, ``max_m`` : of the prediction with 20 steps a sample; ``rmse_m_40_steps`` : with 40;
+    ``rmse_m_held_input`` : with the force held between samples, not band-limited. ``test_rms_m`` : of the test
     itself. ``residual_spectrum`` : frequency Hz and amplitude m of what is left.
     """
 
@@ -168,8 +168,8 @@ class Benchmark:
     rmse_m: float
     max_m: float
     test_rms_m: float
-    finer_m: float
-    held_m: float
+    rmse_m_40_steps: float
+    rmse_m_held_input: float
     test_y_m: FloatArray
     test_model_m: FloatArray
     residual_spectrum: tuple[FloatArray, FloatArray]

@@ -127,7 +127,7 @@ class Retuner:
         self._learner, self._before = learner, data
         self._known = set(_rows(data, np.arange(data.age.size)))
         self._fresh, self._looks = [], 0
-        order = {"kind": "propose", "search": asdict(self.config.search), "torch": self.config.torch}
+        order = {"kind": "propose", "search": asdict(self.config.search)}
         self._job = start_job(order, pack("before", data), self.config.timeout_s)
 
     def _take_proposal(self, result: dict[str, Any], now_s: float) -> None:
@@ -204,7 +204,7 @@ class Retuner:
             job, self._job = self._job, None
             threading.Thread(target=job.cancel, name="retune-end", daemon=True).start()
         self._counts[count] += 1
-        proposal = {key: self._proposed.get(key) for key in ("gamma", "widths", "J2", "J2_before", "search")}
+        proposal = {key: self._proposed.get(key) for key in ("gamma", "widths", "J2", "J2_before")}
         self._last = {"job": self._number, "outcome": count, "detail": why, **proposal, **(more or {})}
         self._proposed, self._before, self._learner = {}, None, None
         self._known, self._fresh = set(), []

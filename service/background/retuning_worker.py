@@ -41,8 +41,8 @@ def unpack(name: str, arrays: Mapping[str, FloatArray]) -> WindowData:
 def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
     """The result of one order.
 
-    ``order`` is ``{"kind": "propose", "search": {...}, "torch": bool}`` for the window ``before`` in the arrays, or
-    ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` for ``before`` and ``after``. Raises DehystError.
+    ``order`` is ``{"kind": "propose", "search": {...}}`` for the window ``before`` in the arrays, or ``{"kind":
+    "compare", "search": {...}, "gamma", "widths"}`` for ``before`` and ``after``. Raises DehystError.
     """
     from dehyst.adaptive.tuning.config import RetuneConfig
     from dehyst.adaptive.tuning.retuning import compare, propose
@@ -54,8 +54,7 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
         hyper = Hyperparameters(float(order["gamma"]), tuple(float(width) for width in order["widths"]))
         trial = compare(data["before"], data["after"], hyper, config)
         return asdict(trial)
-    search, by = _search(bool(order["torch"]))
-    found = propose(data["before"], config, search)
+    found = propose(data["before"], config)
     return {
         "gamma": found.hyper.gamma,
         "widths": list(found.hyper.widths),
@@ -63,23 +62,7 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
         "J2": found.J2,
         "J2_before": found.J2_before,
         "evaluations": found.evaluations,
-        "search": by,
     }
-
-
-def _search(wanted: bool) -> tuple[Any, str]:
-    """(search for starting points, its name): the batch search with torch if it is wanted and installed."""
-    if wanted:
-        from dehyst.baselines.swarm.evidence_search import EvidenceSearch
-        from dehyst.baselines.swarm.identification import MissingTorchError, torch_module
-
-        try:
-            torch_module().set_num_threads(1)
-            search = EvidenceSearch()
-        except MissingTorchError:
-            return None, "starts around the present (torch is not installed)"
-        return search, f"torch on {search.device}"
-    return None, "starts around the present"
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ class RetuningConfig:
     fresh : samples of the window that a proposal is tried on; it was not tuned on them.
     wait_s : longest wait for the fresh samples, s of samples; then the proposal is dropped.
     lead_s : time between announcement and adoption, s of samples, so that a standby adopts at the same sample.
-    timeout_s : longest time of the process, s. torch : find starting points with torch if it is installed.
+    timeout_s : longest time of the process, s.
     search : range of the search and the criterion of a better model; see ``adaptive.tuning.config``.
     """
 
@@ -88,7 +88,6 @@ class RetuningConfig:
     wait_s: float = 120.0
     lead_s: float = 0.5
     timeout_s: float = 60.0
-    torch: bool = True
     search: RetuneConfig = field(default_factory=RetuneConfig)
 
     def __post_init__(self) -> None:

@@ -16,12 +16,12 @@ import numpy as np
 from dehyst.adaptive import lssvm
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureMap
-from dehyst.adaptive.identification import IdentifyConfig, design_features, prior_deviations
+from dehyst.adaptive.identification import IdentifyConfig, design_features, linear_posterior, prior_deviations
 from dehyst.adaptive.lssvm import LssvmModel
 from dehyst.adaptive.smoothing import backward_difference
 from dehyst.adaptive.tuning.evidence import Evidence, evidence_samples
 from dehyst.adaptive.tuning.search import InferenceConfig, infer
-from dehyst.adaptive.types import FloatArray, StateDict
+from dehyst.adaptive.types import FloatArray
 from dehyst.sim.chapter.experiments import DT_S, EVERY
 
 # --- Min-max normalisation of features and targets, (2.42), with its inverse.
@@ -29,44 +29,21 @@ from dehyst.sim.chapter.experiments import DT_S, EVERY
 
 @dataclass(frozen=True, slots=True)
 class MinMaxScaling:
-    """x_n = (x - low) / (high - low), per column; physical units outside, dimensionless inside.
-
-    Attributes
-    ----------
-    low, high : (d,) the values that map to 0 and 1, in the columns' own units; ``high > low``.
-    """
+    """x_n = (x - low)/(high - low), per column; ``low``, ``high`` (d,), the values that map to 0 and 1."""
 
     low: FloatArray
     high: FloatArray
 
-    def __post_init__(self) -> None:
-        low = np.atleast_1d(np.asarray(self.low, dtype=np.float64))
-        high = np.atleast_1d(np.asarray(self.high, dtype=np.float64))
-        if low.ndim != 1 or low.shape != high.shape:
-            raise InputError(f"scaling: low {low.shape} and high {high.shape} must be vectors of one length")
-        if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(high > low)):
-            raise InputError(
-                f"scaling: got low {low.tolist()}, high {high.tolist()}, expected finite low < high in every column; "
-                "a constant feature carries no information, leave it out"
-            )
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
-
     @classmethod
-    def fit(cls, data: FloatArray, margin: float = 0.0) -> MinMaxScaling:
-        """From samples (N, d) or (N,): minimum and maximum, (2.42), widened by ``margin`` of the range each way."""
-        table = np.asarray(data, dtype=np.float64)
-        table = table[:, None] if table.ndim == 1 else table
-        if table.ndim != 2 or table.shape[0] == 0 or not np.all(np.isfinite(table)):
-            raise InputError(f"data: got shape {table.shape}, expected (N, d) finite samples, N >= 1; drop the others")
-        low, high = table.min(axis=0), table.max(axis=0)
-        widen = margin * (high - low)
-        return cls(low - widen, high + widen)
-
-    @property
-    def dimension(self) -> int:
-        """Number of columns d."""
-        return int(self.low.size)
+    def fit(cls, data: FloatArray) -> MinMaxScaling:
+        """From samples (N, d), or (N,) of one column. Raises InputError where one is not finite or does not change."""
+        low, high = np.atleast_1d(data.min(axis=0)), np.atleast_1d(data.max(axis=0))
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and np.all(high > low)):
+            raise InputError(
+                f"data: got {low.tolist()} to {high.tolist()}, expected finite columns that change; leave out a "
+                "constant one, it carries no information"
+            )
+        return cls(low, high)
 
     @property
     def span(self) -> FloatArray:
@@ -74,30 +51,12 @@ class MinMaxScaling:
         return self.high - self.low
 
     def normalise(self, x: FloatArray) -> FloatArray:
-        """(N, d), (d,) or, for one column, (N,): the same shape, dimensionless, not clipped."""
-        return np.asarray((x - self._fit_to(x, self.low)) / self._fit_to(x, self.span), dtype=np.float64)
+        """(N, d) or, for one column, (N,): the same shape, dimensionless, not clipped."""
+        return (x - self.low) / self.span
 
     def denormalise(self, x: FloatArray) -> FloatArray:
         """The inverse of ``normalise``."""
-        return np.asarray(self._fit_to(x, self.low) + x * self._fit_to(x, self.span), dtype=np.float64)
-
-    def state_dict(self) -> StateDict:
-        """Two arrays; ``from_state`` builds an equal scaling."""
-        return {"low": self.low.copy(), "high": self.high.copy()}
-
-    @classmethod
-    def from_state(cls, state: StateDict) -> MinMaxScaling:
-        return cls(np.asarray(state["low"], dtype=np.float64), np.asarray(state["high"], dtype=np.float64))
-
-    def _fit_to(self, x: FloatArray, row: FloatArray) -> FloatArray | float:
-        shape = np.shape(x)
-        if self.dimension == 1 and (not shape or shape[-1] != 1 or len(shape) == 1):
-            return float(row[0])
-        if not shape or shape[-1] != self.dimension:
-            raise InputError(
-                f"x: got shape {shape}, expected {self.dimension} columns, those the scaling was fitted on"
-            )
-        return row
+        return self.low + x * self.span
 
 
 # --- Forward models.
@@ -108,8 +67,8 @@ CHAPTER_INFERENCE = InferenceConfig(method="three_level", ard=False, starts=((10
 MEMORY = IdentifyConfig(plays=20, slow=4, kernel_plays=3, arcs=(0.03, 0.1, 0.3, 0.8))
 #: Its inference: one width for all inputs, because the small residual would let single widths fit noise.
 MEMORY_INFERENCE = InferenceConfig(ard=False, width_range=(0.1, 50.0))
-#: Least noise of the linear part, as a share of the range, and rounds of its estimation.
-_FLOOR, _ROUNDS = 1e-4, 4
+#: Least noise of the linear part, as a share of the range.
+_FLOOR = 1e-4
 
 
 def two_inputs(u_V: FloatArray, dt_s: float = DT_S * EVERY) -> FloatArray:
@@ -163,12 +122,9 @@ class MemoryLssvm:
     kernel: LssvmModel
     evidence: Evidence
 
-    def _inputs(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return _features(self.features, u_V)
-
     def predict(self, u_V: FloatArray) -> FloatArray:
         """Displacement µm of every `EVERY`-th of the voltages ``u_V`` (n,), 1 ms apart, from rest at 0 V."""
-        basis, kernel = self._inputs(u_V)
+        basis, kernel = _features(self.features, u_V)
         return np.asarray(basis @ self.beta + self.kernel.predict(kernel), dtype=np.float64)
 
 
@@ -184,21 +140,6 @@ def _features(features: FeatureMap, u_V: FloatArray) -> tuple[FloatArray, FloatA
     return np.ascontiguousarray(basis[::EVERY]), np.ascontiguousarray(kernel[::EVERY])
 
 
-def posterior_mean(basis: FloatArray, target: FloatArray, deviations: FloatArray, floor: float) -> FloatArray:
-    """(p,) posterior mean of a linear model under a Gaussian prior with standard ``deviations`` (p,).
-
-    ``basis`` (n, p), ``target`` (n,). The noise is estimated from the residual and is at least ``floor``.
-    """
-    gram, moment = basis.T @ basis, basis.T @ target
-    variance = float(np.var(target)) * 1e-4
-    beta: FloatArray = np.zeros(basis.shape[1])
-    for _ in range(_ROUNDS):
-        information = np.diag(deviations**-2.0) + gram / variance
-        beta = np.asarray(np.linalg.solve(information, moment / variance), dtype=np.float64)
-        variance = max(float(np.mean((target - basis @ beta) ** 2)), floor * floor)
-    return beta
-
-
 def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = MEMORY) -> MemoryLssvm:
     """From the commanded voltage (m,), 1 ms apart, and displacements (ceil(m/20),), 0.02 s apart.
 
@@ -210,12 +151,13 @@ def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = 
     features = replace(design_features(_motion(u_fine_V), DT_S, config, True), y_rest_um=0.0)
     basis, kernel = _features(features, u_fine_V)
     span = float(np.ptp(y_um))
-    beta = posterior_mean(basis, y_um, prior_deviations(features, span), _FLOOR * span)
+    deviations = prior_deviations(features, span)
+    beta, _ = linear_posterior(basis, y_um, deviations, float(np.var(y_um)) * 1e-4, _FLOOR * span)
     rest = y_um - basis @ beta
     scale = max(float(np.std(rest)), 1e-12)
     evidence = infer(evidence_samples(kernel, rest / scale), MEMORY_INFERENCE).best
     fit = lssvm.fit(kernel, rest / scale, evidence.widths, evidence.gamma)
     rescaled = replace(
-        fit.model, alpha=fit.model.alpha * scale, beta=fit.model.beta * scale, scale=fit.model.scale * scale**2
+        fit.model, alpha=fit.model.alpha * scale, bias=fit.model.bias * scale, scale=fit.model.scale * scale**2
     )
     return MemoryLssvm(features, beta, rescaled, evidence)

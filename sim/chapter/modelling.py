@@ -15,11 +15,11 @@ from scipy.optimize import least_squares
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.bouc_wen.identify import identify_bouc_wen
+from dehyst.baselines.bouc_wen.identify import identify_bouc_wen, independent_samples
 from dehyst.baselines.bouc_wen.model import BoucWenParameters
 from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
-from dehyst.baselines.swarm.identification import SwarmConfig, swarm_bouc_wen, swarm_mpi
+from dehyst.baselines.swarm import SwarmConfig, swarm_bouc_wen, swarm_mpi
 from dehyst.sim.chapter import published
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
 from dehyst.sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs
@@ -100,12 +100,8 @@ def refine_bouc_wen(
 
     fixed = solve(_NEGLIGIBLE_INERTIA, 4)
     free = min((solve(inertia, 5) for inertia in (start.inertia_s2, _NEGLIGIBLE_INERTIA)), key=lambda entry: entry[0])
-    centred = linear(free[1])[0]
-    centred = centred - centred.mean()
-    correlation = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    # model errors are not white: number of independent samples in them
-    independent = y_um.size * (1.0 - correlation) / (1.0 + max(correlation, -0.9))
-    best = fixed[1] if (fixed[0] - free[0]) * independent < _SIGNIFICANT * free[0] else free[1]
+    gained = (fixed[0] - free[0]) * independent_samples(linear(free[1])[0])
+    best = fixed[1] if gained < _SIGNIFICANT * free[0] else free[1]
     gain, offset = linear(best)[1]
     return _model(best, start).with_gain(float(gain), float(offset)), evaluations
 
@@ -166,19 +162,8 @@ def judge(
     training, training_um = of(data.training)
     generalisation, generalisation_um = of(data.generalisation)
     third = {record.name: of(record)[0] for record in data.third}
-    return ForwardRun(
-        key,
-        label,
-        route,
-        model,
-        parameters,
-        seconds,
-        training,
-        generalisation,
-        third,
-        training_um,
-        generalisation_um,
-    )
+    identified = key, label, route, model, parameters, seconds
+    return ForwardRun(*identified, training, generalisation, third, training_um, generalisation_um)
 
 
 def identify_forward(

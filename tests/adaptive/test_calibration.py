@@ -33,7 +33,7 @@ from tests.online_models import PlainLearner, SmoothingLearner
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
-SEEDS = (1, 2, 3)
+SEEDS = (1, 2)
 GAIN_STEP: tuple[ParameterChange, ...] = ((6.0, {"gain_drift.gain": -0.06}),)
 #: Factors of the stated deviation within which 68 % and 95 % of the errors are to lie.
 ONE, INTERVAL_95 = 1.0, 1.96

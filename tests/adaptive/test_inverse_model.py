@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
-from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate
+from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from dehyst.adaptive.kernels import gram
 from dehyst.adaptive.types import InverseModel
 
@@ -27,37 +27,33 @@ def test_is_an_inverse_model(model: LssvmInverse) -> None:
 
 def test_equals_its_formula(model: LssvmInverse) -> None:
     y, v, a = points()
-    memory = model.rest_memory(40.0)
-    basis, kernel, after = model.features.run(y, v, a, memory)
-    expected = basis @ model.beta + gram(kernel, model.support, model.widths) @ model.alpha
-    answer = model.feedforward(y, v, a, memory)
-    np.testing.assert_allclose(answer.u_V, expected, atol=1e-10)
-    np.testing.assert_array_equal(answer.memory, after)
-    assert model.mean(basis[7], kernel[7]) == pytest.approx(expected[7], abs=1e-10)
-
-
-def test_the_packed_model_is_the_model(model: LssvmInverse) -> None:
-    y, v, a = points()
-    p = model.features.basis_size
-    spread = 1e-4 * np.eye(p) + 1e-5
+    spread = 1e-4 * np.eye(model.features.basis_size) + 1e-5
     for one in (
         model,
         replace(model, beta_covariance=spread),
         replace(model, support=model.support[:0], alpha=model.alpha[:0]),
         replace(model, beta_covariance=spread, anchor=1.1 * model.beta, allowed_V=0.05),
     ):
-        memory, n = model.rest_memory(40.0), y.size
-        u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        margin = DOMAIN_MARGIN * np.repeat(one.domain[1::2] - one.domain[::2], 2) * np.array([-1.0, 1.0] * 3)
-        evaluate(
-            y, v, a, memory, one.features.arrays, one.beta, one.beta_covariance,
-            np.ascontiguousarray((one.support / one.widths).T), one.alpha, 1.0 / one.widths, one.noise_variance,
-            one.kernel_variance, 1.0 / (1.0 + 1.0 / one.gamma), one.domain + margin, one.anchor, one.allowed_V, u, std,
-            inside,
-        )  # fmt: skip
-        answer = one.feedforward(y, v, a, model.rest_memory(40.0))
-        for got, expected in ((answer.u_V, u), (answer.std_V, std), (answer.inside, inside), (answer.memory, memory)):
-            np.testing.assert_array_equal(got, expected)
+        basis, kernel, after = one.features.run(y, v, a, one.rest_memory(40.0))
+        column = gram(kernel, one.support, one.widths)
+        mean = basis @ one.beta + column @ one.alpha
+        assert one.mean(basis[7], kernel[7]) == pytest.approx(mean[7], abs=1e-10)
+        if one.anchor.size:
+            mean = np.clip(mean, basis @ one.anchor - one.allowed_V, basis @ one.anchor + one.allowed_V)
+        variance = np.full(y.size, one.noise_variance)
+        if one.beta_covariance.size:
+            variance += np.sum(basis @ one.beta_covariance * basis, axis=1)
+        nearest = column.max(axis=1, initial=0.0)
+        variance += one.kernel_variance * (1.0 - nearest**2 / (1.0 + 1.0 / one.gamma))
+        low, high = one.domain[::2], one.domain[1::2]
+        margin, motion = DOMAIN_MARGIN * (high - low), np.column_stack([y, v, a])
+        answer = one.feedforward(y, v, a, one.rest_memory(40.0))
+        np.testing.assert_allclose(answer.u_V, mean, atol=1e-10)
+        np.testing.assert_allclose(answer.std_V, np.sqrt(np.maximum(variance, 0.0)), atol=1e-9)
+        np.testing.assert_array_equal(
+            answer.inside, np.all((low - margin <= motion) & (motion <= high + margin), axis=1)
+        )
+        np.testing.assert_array_equal(answer.memory, after)
 
 
 def test_no_answer_leaves_what_was_identified_by_more_than_is_allowed(model: LssvmInverse) -> None:

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray
 from dehyst.baselines import fit_bouc_wen, fit_linear, fit_mpi
 from dehyst.baselines.bouc_wen.identify import identify_bouc_wen
@@ -21,9 +20,9 @@ from dehyst.baselines.bouc_wen.model import TABLE_2_1
 from dehyst.baselines.bounded_least_squares import bounded_least_squares, bounded_minimum
 from dehyst.baselines.linear import identify_linear
 from dehyst.baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
-from dehyst.baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
+from dehyst.baselines.prandtl_ishlinskii.model import inverse_thresholds, inverse_weights
 from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from dehyst.baselines.swarm.identification import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
+from dehyst.baselines.swarm import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
 
 # --- Identification: known parameters come back, scale and offset hold, bad recordings are refused by name.
 
@@ -238,13 +237,6 @@ def test_a_falling_displacement_is_named() -> None:
         identify_bouc_wen(u, -TABLE_2_1.simulate(u, 0.02), 0.02)
 
 
-def test_saturation_helper_round_trip() -> None:
-    model = from_inverse_saturation(
-        np.array([0.0, 1.0]), np.array([5.0, 1.0]), np.array([0.0, 9.0]), np.array([1.0, 0.3]), 0.5, -2.0, 1e-3
-    )
-    assert load(type(model), save(model)) == model
-
-
 class TestSwarm:
     """Batched swarms; torch is part of the test environment."""
 
@@ -304,7 +296,7 @@ class TestSwarm:
 # --- Bounded least squares from normal equations: what scipy finds from the rows, and the conditions for a minimum.
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(p=st.integers(1, 24), seed=st.integers(0, 2**32 - 1), spread=st.floats(0.0, 2.0))
 def test_is_what_scipy_finds_from_the_rows(p: int, seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
@@ -328,7 +320,7 @@ def test_all_free_is_ordinary_least_squares_and_all_bound_stays_there() -> None:
     normal, right = rows.T @ rows, rows.T @ target
     free = bounded_minimum(normal, right, np.full(4, -np.inf))
     assert free == pytest.approx(np.linalg.lstsq(rows, target, rcond=None)[0])
-    assert np.array_equal(bounded_minimum(normal, right, np.full(4, 10.0)), np.full(4, 10.0))
+    assert bounded_minimum(normal, right, np.full(4, 10.0)) == pytest.approx(np.full(4, 10.0), rel=1e-14)
 
 
 @pytest.mark.parametrize("bad", [np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]]), np.full((2, 2), np.nan)])

@@ -198,20 +198,6 @@ def test_rest_teaches_nothing(kind: str) -> None:
     assert model.snapshot() == before
 
 
-@every
-def test_a_stored_state_goes_on_to_the_last_bit(kind: str) -> None:
-    u = drive(4000)
-    y = 10.5 * u + 1.0
-    whole, half = build(kind), build(kind)
-    feed(whole, u, y)
-    feed(half, u[:1733], y[:1733])
-    restored = type(half).from_state(half.state_dict())
-    feed(restored, u[1733:], y[1733:], first=1733)
-    assert restored.snapshot() == whole.snapshot()
-    assert restored.counters() == whole.counters()
-    assert restored.seq == whole.seq
-
-
 def test_outliers_are_refused_until_they_persist() -> None:
     u = drive(6000)
     y = TABLE_2_1.simulate(u, DT)

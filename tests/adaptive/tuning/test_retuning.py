@@ -165,19 +165,6 @@ def test_starts_fill_the_box_from_what_is_at_work() -> None:
         assert np.histogram(column, 8, (0.0, 1.0))[0].min() >= 4
 
 
-def test_a_search_gives_the_starts(before: WindowData, proposal: Proposal) -> None:
-    asked = []
-
-    def search(data: object, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        asked.append(start)
-        return np.log([[proposal.hyper.gamma, *proposal.hyper.widths]])
-
-    found = propose(before, RetuneConfig(rows=80), search)
-    assert len(asked) == 1
-    assert found.J2 <= proposal.J2 + 1e-3
-    assert found.evaluations < proposal.evaluations
-
-
 def test_what_cannot_be_tuned_is_refused(before: WindowData) -> None:
     with pytest.raises(InputError, match="60"):
         propose(samples(40, 1))

@@ -72,29 +72,6 @@ def test_every_slot_can_be_replaced(form: Form, slot: int) -> None:
     assert_exact(window)
 
 
-BAD_SAMPLES = [
-    (np.array([np.nan, 0, 0]), 1.0, 1.0),
-    (np.array([0, np.inf, 0]), 1.0, 1.0),
-    (np.zeros(3), np.nan, 1.0),
-    (np.zeros(3), -np.inf, 1.0),
-    (np.zeros(3), 1.0, 0.0),
-    (np.zeros(3), 1.0, -1.0),
-    (np.zeros(3), 1.0, np.inf),
-    (np.zeros(3), 1.0, np.nan),
-]
-
-
-@forms
-@pytest.mark.parametrize("bad", BAD_SAMPLES)
-def test_bad_samples_are_refused_and_counted(form: Form, bad: tuple[np.ndarray, float, float]) -> None:
-    window = filled(form, n=CAPACITY - 1)
-    alpha = window.alpha
-    assert window.replace(3, *bad) is Status.BAD_INPUT
-    assert window.append(*bad) is Status.BAD_INPUT
-    np.testing.assert_array_equal(window.alpha, alpha)
-    assert window.counters()["bad_inputs"] == 2
-
-
 @forms
 def test_slots_that_do_not_exist(form: Form) -> None:
     window = filled(form, n=5)
@@ -273,39 +250,13 @@ def test_leave_one_out_of_samples_that_determine_a_coefficient_alone_is_no_numbe
     assert np.isnan(window.leave_one_out()).all()
 
 
-def test_the_diagonal_is_carried_along_while_it_is_asked_for() -> None:
-    """A step with it costs O(N²) and no factor's whole inverse: the elements are those of the step before, moved."""
-    window, rng = filled("cholesky"), np.random.default_rng(12)
-    A = window.arrays
-    assert A.C[ws.CARRIED] == 0
-    window.leave_one_out()
-    assert A.C[ws.CARRIED] == CAPACITY
-    # An element that is off stays off but for its own turn, which comes within a round: nothing is made anew at a call.
-    A.V[ws.DIAGONAL, 3] *= 1.5
-    A.C[ws.CURSOR] = 4
-    window.replace(0, *sample(rng))
-    exact = np.diag(np.linalg.inv(A.R))
-    window.leave_one_out()
-    off = np.abs(A.V[ws.DIAGONAL] / exact - 1.0) > 1e-9
-    np.testing.assert_array_equal(np.flatnonzero(off), [3])
-    for _ in range(CAPACITY):
-        window.replace(0, *sample(rng))
-    np.testing.assert_allclose(A.V[ws.DIAGONAL], np.diag(np.linalg.inv(A.R)), rtol=1e-9)
-    assert A.C[ws.CARRIED] == 0
-    window.replace(5, *sample(rng))
-    assert_exact(window)
-
-
-def test_the_carried_diagonal_does_not_drift_at_cond_1e8() -> None:
+def test_leave_one_out_of_the_cholesky_form_at_cond_1e8_after_many_steps() -> None:
     rng, n = np.random.default_rng(1), 60
-    X = rng.random((4000, 3))
-    y = np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(4000)
+    X = rng.random((1000, 3))
+    y = np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(1000)
     window = Window.from_samples(WindowConfig(n, (1.5,) * 3, 2e6, form="cholesky"), X[:n], y[:n])
-    for k in range(n, 4000):
+    for k in range(n, 1000):
         assert window.replace(int(rng.integers(n)), X[k], y[k]) is Status.ACCEPTED
-        if k % 20 == 0:
-            window.leave_one_out()
-    assert window.arrays.C[ws.CARRIED] > 0
     expected = lssvm.fit(window.X, window.y, 1.5, 2e6).leave_one_out()
     assert np.linalg.norm(window.leave_one_out() - expected) < 1e-7 * np.linalg.norm(expected)
 

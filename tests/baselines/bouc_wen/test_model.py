@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
+from dehyst.baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, identify_mechanical
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from dehyst.baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
 from dehyst.baselines.common import Domain
@@ -159,17 +159,6 @@ def test_the_stiff_stage_settles_where_the_drive_says() -> None:
     assert y[3] < 0.8 * y[-1]
 
 
-def test_points_that_are_not_finite_leave_no_trace() -> None:
-    inverse = BoucWenInverse(TABLE_2_1, 1e-3, WIDE)
-    memory, zero = inverse.rest_memory(20.0), np.zeros(3)
-    good = inverse.feedforward(np.array([21.0, 22.0]), zero[:2], zero[:2], memory)
-    bad = inverse.feedforward(np.array([21.0, np.nan, 22.0]), zero, zero, memory)
-    assert np.isnan(bad.u_V[1])
-    assert not bad.inside[1]
-    np.testing.assert_array_equal(bad.u_V[[0, 2]], good.u_V)
-    np.testing.assert_array_equal(bad.memory, good.memory)
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -201,16 +190,6 @@ def multisine(n: int, rms: float, seed: int) -> FloatArray:
     return np.asarray(u * (rms / np.std(u)), dtype=np.float64)
 
 
-def test_interpolation_is_exact_for_a_band_limited_signal() -> None:
-    t = np.arange(64) / 64
-    fine = np.arange(64 * 8) / (64 * 8)
-
-    def wave(t: FloatArray) -> FloatArray:
-        return np.asarray(np.sin(2 * np.pi * 5 * t + 0.3) + 0.2 * np.cos(2 * np.pi * 29 * t), dtype=np.float64)
-
-    np.testing.assert_allclose(between_samples(wave(t), 8), wave(fine), atol=1e-12)
-
-
 def test_integration_agrees_with_an_adaptive_solver_written_from_the_equation() -> None:
     n, dt_s = 256, 1.0 / RATE_HZ
     u = multisine(n, 50.0, 1)
@@ -232,12 +211,6 @@ def test_integration_agrees_with_an_adaptive_solver_written_from_the_equation() 
     found = solve_ivp(right, (0.0, at[-1]), [0.0, 0.0, 0.0], t_eval=at, rtol=1e-8, atol=1e-11, max_step=dt_s / 2)
     out = MODEL.steady_state(u, dt_s, oversample=40, settle=float(periods))
     assert np.max(np.abs(out - found.y[0])) < 2e-4 * np.std(out)
-
-
-def test_steps_of_half_the_size_change_little() -> None:
-    u = multisine(1024, 50.0, 2)
-    coarse, fine = (MODEL.steady_state(u, 1.0 / RATE_HZ, steps, 2.0) for steps in (10, 20))
-    assert np.std(coarse - fine) < 3e-4 * np.std(fine)
 
 
 def test_identification_finds_the_parameters_of_a_noisy_record() -> None:

@@ -236,15 +236,6 @@ def test_callers_go_over_without_a_jump_each_in_its_own_stream() -> None:
     assert long.std_V[20] > 0.5 * whole * 0.4
 
 
-def test_one_alone_answers_as_the_champion_itself_to_the_last_bit() -> None:
-    mpi = MpiInverse(MPI, DT, SEEN, 0.01)
-    y, zero = np.linspace(5.0, 50.0, 40), np.zeros(40)
-    for champion in (0, 1):
-        served = ChampionInverse(("mpi", "linear"), (mpi, line()), champion)
-        own = (mpi, line())[champion].feedforward(y, zero, zero, (mpi, line())[champion].rest_memory(5.0))
-        np.testing.assert_array_equal(served.feedforward(y, zero, zero, served.rest_memory(5.0)).u_V, own.u_V)
-
-
 def test_one_contestant_is_exchanged_and_the_champion_stays() -> None:
     models = (line(), line(offset_um=1.0))
     before = ChampionInverse(("one", "two"), models, 1)

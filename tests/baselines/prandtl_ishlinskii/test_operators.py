@@ -11,17 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import load, save
+from dehyst.adaptive.state import save
 from dehyst.baselines.common import Domain
 from dehyst.baselines.prandtl_ishlinskii import operators
 from dehyst.baselines.prandtl_ishlinskii.model import (
     MpiInverse,
     MpiParameters,
-    from_inverse_saturation,
     inverse_thresholds,
     inverse_weights,
-    states_from_inverse,
-    states_to_inverse,
 )
 from dehyst.baselines.prandtl_ishlinskii.online import GainFilter
 from dehyst.baselines.prandtl_ishlinskii.operators import (
@@ -114,20 +111,6 @@ def test_inverting_twice_gives_the_model_back(seed: int, n: int, m: int) -> None
         np.testing.assert_allclose(twice_r, r, rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
-@given(seed=seeds)
-def test_initial_states_convert_both_ways(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    model = random_mpi(rng, 6, 0)
-    state, there, back = rng.normal(0, 3, 7), np.empty(7), np.empty(7)
-    states_to_inverse(model.w_h_, state, there)
-    w = model.w_h_
-    expected = [w[: i + 1].sum() * state[i] + (w[i + 1 :] * state[i + 1 :]).sum() for i in range(7)]  # (2.15)
-    np.testing.assert_allclose(there, expected, atol=1e-11)
-    states_from_inverse(np.cumsum(w), there, back)
-    np.testing.assert_allclose(back, state, atol=1e-11)
-
-
 def test_tables_2_2_and_2_3_agree() -> None:
     """The chapter's own numbers: (2.12)-(2.18) take Table 2.2 to Table 2.3."""
     r = 0.6036 * np.arange(13)
@@ -163,14 +146,6 @@ def test_lag_is_led_by_the_inverse() -> None:
     assert np.max(np.abs(model.simulate(late, 1e-3) - y)) > 0.5
 
 
-def test_saturation_given_by_its_inverse() -> None:
-    d_star, w_star = np.array([0.0, 10.0, 30.0]), np.array([1.0, 0.2, -0.1])
-    model = from_inverse_saturation(np.array([0.0]), np.array([1.0]), d_star, w_star, 0.0, 0.0)
-    y = np.array([5.0, 20.0, 50.0])
-    x = dead_zone(y, d_star) @ w_star
-    np.testing.assert_allclose(model.simulate(x, 1.0), y, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -191,25 +166,6 @@ def test_play_start_is_the_initial_condition() -> None:
 
 
 # --- Gain and offset of a frame: the Kalman filter of two random walks, and nothing taken that is not finite.
-
-
-def test_it_is_the_kalman_filter_of_two_random_walks() -> None:
-    rng = np.random.default_rng(5)
-    made = GainFilter.start(0.02, 0.5, 0.01)
-    x, P, Q = np.array([1.0, 0.0]), made.covariance.copy(), np.diag(made.walk)
-    for k in range(300):
-        model = 30.0 + 25.0 * np.sin(0.1 * k)
-        y = 0.94 * model + 0.7 + 0.05 * rng.standard_normal()
-        made.update(y, model, 0.01)
-        # Textbook form, with the information of the sample added to that of the state.
-        P = P + Q
-        h = np.array([model, 1.0])
-        P = np.linalg.inv(np.linalg.inv(P) + np.outer(h, h) / 0.01)
-        x = x + P @ h / 0.01 * (y - float(h @ x))
-        np.testing.assert_allclose([made.gain, made.offset_um], x, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(made.covariance, P, rtol=1e-6)
-    assert made.gain == pytest.approx(0.94, abs=0.01)
-    assert made.to_model(0.94 * 40.0 + 0.7) == pytest.approx(40.0, abs=0.3)
 
 
 def test_it_is_the_librarys_filter_step_by_step() -> None:
@@ -236,13 +192,3 @@ def test_what_would_not_stay_finite_changes_nothing(pair: tuple[float, float]) -
     after = save(made)
     assert (after["gain"], after["offset_um"]) == (before["gain"], before["offset_um"])
     np.testing.assert_array_equal(after["covariance"], before["covariance"])
-
-
-def test_a_restored_one_goes_on_to_the_last_bit() -> None:
-    made, again = GainFilter.start(0.02, 0.5, 0.01), GainFilter.start(0.02, 0.5, 0.01)
-    for k in range(20):
-        made.update(9.0 + k, 10.0 + k, 0.01)
-    again = load(GainFilter, save(made), given={"walk": made.walk})
-    for one in (made, again):
-        one.update(31.0, 30.0, 0.01)
-    assert (made.gain, made.offset_um) == (again.gain, again.offset_um)

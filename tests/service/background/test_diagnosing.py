@@ -290,7 +290,7 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
         f"recorder = {json.dumps(str(tmp_path / 'recording'))}\n"
         "[axis.diagnosis]\nhistory_s = 8\nreference_s = 4\nrecent_s = 3\ncollect_s = 2.5\n"
         f"reports = {json.dumps(str(tmp_path / 'reports'))}\n"
-        "[axis.retuning]\nperiod_s = 0.0\nfresh = 60\ntorch = false\n"
+        "[axis.retuning]\nperiod_s = 0.0\nfresh = 60\n"
         "search = {starts = 2, rows = 100, iterations = 15}\n"
     )
     u_V = voltages(model_file, 20.0)

@@ -22,7 +22,7 @@ from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.types import FloatArray, Hyperparameters, WindowData
 from dehyst.service.answers.guard import Limits
 from dehyst.service.background.retuner import Retuner
-from dehyst.service.background.retuning_worker import _search, pack, start_job, tuned
+from dehyst.service.background.retuning_worker import pack, start_job
 from dehyst.service.background.settings import RetuningConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.samples import SampleBatch
@@ -45,8 +45,8 @@ def window_data(n: int, seed: int = 1) -> WindowData:
     return WindowData(X, target_V, np.ones(n), np.arange(n, 0, -1.0) - 1.0, NARROW)
 
 
-def order(search: RetuneConfig, torch: bool = False) -> dict[str, Any]:
-    return {"kind": "propose", "search": asdict(search), "torch": torch}
+def order(search: RetuneConfig) -> dict[str, Any]:
+    return {"kind": "propose", "search": asdict(search)}
 
 
 # ---- the process
@@ -86,31 +86,6 @@ def test_the_working_process_has_the_lowest_priority_and_one_thread() -> None:
     assert "error" not in job.result
     assert job.result["changed"] is True
     assert job.result["J2"] < job.result["J2_before"] - 100.0
-
-
-def test_torch_gives_the_starts_where_it_is_wanted_and_installed() -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    threads = torch.get_num_threads()
-    arrays = pack("before", window_data(80))
-    search = RetuneConfig(starts=2, rows=60, iterations=15)
-    try:
-        with_torch = tuned(order(search, torch=True), arrays)
-        # A working process has one thread, torch's own pool included.
-        assert torch.get_num_threads() == 1
-    finally:
-        torch.set_num_threads(threads)
-    without = tuned(order(search), arrays)
-    assert with_torch["search"].startswith("torch on ")
-    assert without["search"] == "starts around the present"
-    assert with_torch["changed"] is True
-    assert with_torch["J2"] < with_torch["J2_before"] - 30.0
-    # Where both find the same basin they agree; torch's starts lead to none that is worse.
-    assert with_torch["J2"] <= without["J2"] + 0.1
-
-
-def test_without_torch_the_starts_are_around_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
-    assert "torch is not installed" in _search(True)[1]
 
 
 # ---- the thread that learns

@@ -181,7 +181,7 @@ def test_a_state_goes_on_to_the_last_bit_with_adoptions_to_come(
 
 @pytest.fixture
 def retuner(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Retuner]:
-    settings: dict[str, Any] = {"period_s": 0.0, "fresh": 80, "lead_s": 0.1, "torch": False}
+    settings: dict[str, Any] = {"period_s": 0.0, "fresh": 80, "lead_s": 0.1}
     # A short search: where kernels are far too wide, any descent finds it.
     settings["search"] = RetuneConfig(starts=2, rows=100, iterations=15)
     made = Retuner(RetuningConfig(**{**settings, **getattr(request, "param", {})}), tmp_path)

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
 from dehyst.baselines import fit_bouc_wen
@@ -30,7 +28,7 @@ from dehyst.sim.chapter.control import (
     training_reference,
 )
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width
-from dehyst.sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs, posterior_mean
+from dehyst.sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs
 from dehyst.sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
 from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.closed_loop import track
@@ -101,7 +99,7 @@ def test_two_inputs_give_the_reference_values_of_the_solver() -> None:
     model = fit_two_inputs(table["u_V"], table["y_um"], (741.0, 0.4))
     solution = np.loadtxt(file.parent / "alpha_g741_s0.4.csv", delimiter=",").ravel()
     # The first rate is the second one's here and zero there, and moves the solution a little; the rest is the same.
-    assert model.model.beta[0] == pytest.approx(solution[0], rel=2e-2)
+    assert model.model.bias == pytest.approx(solution[0], rel=2e-2)
     assert np.linalg.norm(model.model.alpha) == pytest.approx(140.602836, rel=2e-2)
     residual = model.predict(np.repeat(table["u_V"], EVERY)) - table["y_um"]
     assert np.sqrt(np.mean(residual**2)) / np.ptp(table["y_um"]) == pytest.approx(0.00848576, rel=1e-2)
@@ -131,16 +129,6 @@ def test_refining_finds_the_truth_from_500_displacements() -> None:
     assert np.sqrt(np.mean((found.simulate(u, DT_S)[::EVERY] - y) ** 2)) < 0.0055
     with pytest.raises(InputError, match="y_um"):
         refine_bouc_wen(start, u, y[:-1], DT_S, EVERY)
-
-
-def test_posterior_mean_shrinks_to_the_prior_and_not_further() -> None:
-    rng = np.random.default_rng(0)
-    basis = rng.standard_normal((200, 3))
-    truth = np.array([2.0, -1.0, 0.5])
-    target = basis @ truth + 1e-3 * rng.standard_normal(200)
-    np.testing.assert_allclose(posterior_mean(basis, target, np.full(3, 10.0), 1e-4), truth, atol=1e-3)
-    tight = posterior_mean(basis, target, np.array([10.0, 10.0, 1e-6]), 1e-4)
-    assert abs(tight[2]) < 0.1
 
 
 def test_memory_is_what_makes_the_difference_on_the_rich_stage(rich: Experiments) -> None:
@@ -289,45 +277,16 @@ def test_an_identified_bouc_wen_is_exact_on_its_own_stage() -> None:
 # --- Min-max normalisation and its inverse.
 
 
-def test_range_maps_to_zero_and_one() -> None:
-    data = np.array([[1.0, -5.0], [3.0, 5.0], [2.0, 0.0]])
-    np.testing.assert_array_equal(MinMaxScaling.fit(data).normalise(data), [[0, 0], [1, 1], [0.5, 0.5]])
+@pytest.mark.parametrize("data", [np.array([[1.0, -5.0], [3.0, 5.0], [2.0, 0.0]]), np.array([0.0, 4.0, 1.0])])
+def test_range_maps_to_zero_and_one_and_back(data: np.ndarray) -> None:
+    scaling = MinMaxScaling.fit(data)
+    scaled = scaling.normalise(data)
+    assert (scaled.min(axis=0) == 0.0).all()
+    assert (scaled.max(axis=0) == 1.0).all()
+    np.testing.assert_allclose(scaling.denormalise(scaled), data, rtol=1e-12)
 
 
-def test_margin_widens_both_ways() -> None:
-    scaling = MinMaxScaling.fit(np.array([0.0, 10.0]), margin=0.1)
-    assert (scaling.low[0], scaling.high[0]) == (-1.0, 11.0)
-
-
-@given(seed=st.integers(0, 10_000), shape=st.sampled_from([(3,), (5, 3), (1, 3)]))
-def test_inverse(seed: int, shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(seed)
-    scaling = MinMaxScaling(np.array([-1.0, 0.0, 100.0]), np.array([1.0, 1e-3, 1e5]))
-    x = rng.standard_normal(shape) * 50
-    back = scaling.denormalise(scaling.normalise(x))
-    np.testing.assert_allclose(back, x, rtol=1e-12, atol=1e-9)
-    assert back.shape == x.shape
-
-
-def test_one_column_takes_vectors() -> None:
-    scaling = MinMaxScaling.fit(np.array([0.0, 4.0]))
-    np.testing.assert_array_equal(scaling.normalise(np.array([0.0, 1.0, 2.0])), [0, 0.25, 0.5])
-    np.testing.assert_array_equal(scaling.normalise(np.array([[1.0], [2.0]])), [[0.25], [0.5]])
-
-
-def test_state_round_trip() -> None:
-    scaling = MinMaxScaling.fit(np.random.default_rng(0).random((10, 2)))
-    again = MinMaxScaling.from_state(scaling.state_dict())
-    np.testing.assert_array_equal(again.low, scaling.low)
-    np.testing.assert_array_equal(again.high, scaling.high)
-
-
-@pytest.mark.parametrize("data", [np.array([[1.0, 2.0], [1.0, 3.0]]), np.empty((0, 2)), np.array([[np.nan], [1.0]])])
+@pytest.mark.parametrize("data", [np.array([[1.0, 2.0], [1.0, 3.0]]), np.array([[np.nan], [1.0]])])
 def test_data_that_cannot_be_scaled(data: np.ndarray) -> None:
     with pytest.raises(InputError):
         MinMaxScaling.fit(data)
-
-
-def test_wrong_number_of_columns() -> None:
-    with pytest.raises(InputError, match="columns"):
-        MinMaxScaling.fit(np.random.default_rng(0).random((4, 2))).normalise(np.zeros((5, 3)))

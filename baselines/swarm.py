@@ -23,8 +23,6 @@ from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, p
 
 # --- Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts.
 
-#: Called after each epoch with its number, from 1, and the best cost so far. Returning False stops the swarm.
-
 
 class MissingTorchError(DehystError, ImportError):
     """torch is not installed; the message says how to install it."""
