@@ -17,7 +17,7 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureArrays
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import answers, drive_V, mean_slope
+from dehyst.adaptive.online.dead_reckoning import answers, drive_V
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
 from dehyst.adaptive.online.learner import MARK_S, Learner
@@ -87,8 +87,8 @@ class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
     numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
-    dead band of the frame that is served. marks : (B, 2, 1 + p, p) estimates and covariances, see ``MARKS``; ages :
-    when they were made. basis : (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more
+    dead band of the frame that is served. marks : (B, 2, 1 + p, p) estimates and covariances, see ``MARKS``.
+    basis : (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more
     than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
     places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
     `adaptive.online.track.Past`; past_from : voltages written before each; past_voltages : ring of all voltages.
@@ -112,7 +112,6 @@ class Rows(NamedTuple):
     beta: FloatArray
     covariance: FloatArray
     marks: FloatArray
-    ages: IntArray
     delay: FloatArray
     domain: FloatArray
     basis: FloatArray
@@ -166,9 +165,8 @@ def check_alike(bases: Sequence[LssvmInverse]) -> None:
 def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Sequence[Learner]) -> Fixed:
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
-    steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
-             "mark_every": max(1, round(MARK_S / step_s)), "window_every": config.window_every,
-             "fifo": config.eviction == "fifo"}  # fmt: skip
+    steps = {"dt_s": dt_s, "step_s": step_s, "mark_every": max(1, round(MARK_S / step_s)),
+             "window_every": config.window_every, "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
     for base, template, number in zip(bases, templates, numbers, strict=True):
@@ -177,7 +175,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         reach_V = template.parts.allowed_V - shape * drive_V(template.base)
         axes.append({
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
-            "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
+            "drive_V": drive_V(base), "tells": answers(base),
             "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0,
             "model": number,
         })  # fmt: skip
@@ -200,7 +198,6 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
 def _ordinary(model: LssvmInverse, config: LearnerConfig) -> StateDict:
     """The state of a learner that has just got all that an ordinary one has."""
     learner, f = Learner(model, config), model.features
-    # Not one more: with the next one a control trial may begin, which is none of what every one has.
     for k in range(learner.parts.intake.smoother.config.lag + 1):
         learner.handle(Sample(k, k * model.dt_s, 0.0, 0.5 * (f.y_min_um + f.y_max_um)))
     # A state that was read has its kinds of numbers, whatever was given.
@@ -214,7 +211,7 @@ class FleetState:
         B, state = len(bases), _ordinary(bases[0], config)
         p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
         likes = {name: state[path] for name, path in _ARRAYS.items()} | {
-            "frames": np.zeros(3), "marks": np.zeros((marks, 1 + p, p)), "ages": np.zeros(marks, dtype=np.int64),
+            "frames": np.zeros(3), "marks": np.zeros((marks, 1 + p, p)),
             "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2), "basis": np.zeros(p),
             "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
             "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
@@ -227,7 +224,6 @@ class FleetState:
         self._fields = {path: getattr(s, name) for name, path in _ARRAYS.items()}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j, 0], f"{mark}.covariance": s.marks[:, j, 1:]}
-        self._fields |= {"mark_ages": s.ages}
         parts: dict[str, Any] = {
             "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
             "memory": slice(4 + 2 * lag, None),

@@ -9,7 +9,6 @@ so that a change is learnt once and the old samples of the window stay valid.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite, sqrt
 from typing import Annotated, Any
@@ -23,10 +22,10 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
-from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
+from dehyst.adaptive.online.drift import SLOW_S, DriftFilter, Mark, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from dehyst.adaptive.online.glitch_or_jump import level_of
-from dehyst.adaptive.online.intake import Intake
+from dehyst.adaptive.online.intake import Intake, credit_after
 from dehyst.adaptive.online.kernel_window import ResidualWindow, due
 from dehyst.adaptive.online.missing_motion import MissingMotion
 from dehyst.adaptive.online.track import Pair
@@ -51,8 +50,8 @@ from dehyst.adaptive.types import (
 # learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
 
 
-#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
-LONG_S, SHORT_S = 2.0, 0.1
+#: Time constant of the mean square errors that detect trouble, s; those for reports have the filter's ``SLOW_S``.
+SHORT_S = 0.1
 
 #: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
 FALLBACK_RATIO = 1.3
@@ -78,7 +77,7 @@ class Judgement:
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """Take one error of the learnt and of the frozen model, V."""
         squared = error_V * error_V
-        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
+        slow, fast = min(1.0, step_s / SLOW_S), min(1.0, step_s / SHORT_S)
         if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
             self.inside += 1
         self.error_V = error_V
@@ -166,15 +165,9 @@ ROLLBACK_S, MARK_S = 0.5, 1.0
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
-#: Time between two checks of the sensor, s; at least a step of the filter.
-CHECK_S = 0.004
-#: While readings are on trial, the identified model is served if its recent rms error is below ``MOVES`` times the
-#: recent motion of the estimate, and below this share of the span. An estimate that hardly moves is far better than
-#: the identified model. One that moved much may have followed a real change of the stage; the share covers that case.
-#: The error of the last estimate during a trial was 0.2 to 8 times its motion before (16 foreign stages).
-MOVES, ALONE_SHARE = 5.0, 0.02
-#: Shares of the range at which the motion of the estimate is taken, in both directions.
-COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
+#: While readings are on trial, the identified model is served if its recent rms error is below this share of the span:
+#: the last estimate may contain a beginning fault.
+IDENTIFIED_SHARE = 0.02
 
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
@@ -182,23 +175,11 @@ NEWEST = 100
 MOST_MOVED = 2.0
 
 
-def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float = 0.0) -> FloatArray:
-    """(n, p) basis at ``shares`` of the range, each reached from rest in one stroke and passed with ``v_um_per_s``."""
-    rows, kernel = np.empty((len(shares), features.basis_size)), np.empty(features.kernel_size)
-    for row, share in zip(rows, shares, strict=True):
-        y_um = features.offset_um + features.gain * (
-            features.y_min_um + share * (features.y_max_um - features.y_min_um)
-        )
-        features.fill(y_um, v_um_per_s, 0.0, features.rest_memory(y_um), row, kernel)
-    return rows
-
-
 class Parts:
     """The changing state of a learner, and the operations on several of its parts.
 
     first : the filter's estimate of the identified model.
     window : the kernel part, whose state is among the entries ``window``.
-    check_every, check_s : samples between two checks of the sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     """
 
@@ -214,10 +195,6 @@ class Parts:
     # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
     mark: Annotated[Mark, Entry("a good estimate of the filter")]
     next_mark: Annotated[Mark, Entry("a newer one")]
-    mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
-    alone: Annotated[bool, Entry("whether the identified model is served because readings are on trial")]
-    moved_V: Annotated[float, Entry("how far the estimate had moved before that trial, rms", "V", low=0.0)]
-    moved_s: Annotated[float, Entry("within what time", "s", low=1e-9)]
 
     def __init__(
         self,
@@ -236,46 +213,30 @@ class Parts:
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark = self.filter.mark()
         self.next_mark = self.mark
-        self.mark_ages = (0, 0)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
         self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
         self.rest = RestCreep()
         self.delay = Delay(round(config.serving_age_s / step_s))
-        steps = max(1, round(CHECK_S / self.filter.step_s))
-        self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
         # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
         if allowed_V is None:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.allowed_V = allowed_V
-        v = base.features.v_scale_um_per_s
-        self.rows = np.concatenate([basis_over(base.features, COMPARED, way * v) for way in (-1.0, 1.0)])
-        self.alone = False
-        self.moved_V, self.moved_s = 0.0, MARK_S
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
-
-    def expect_change(self) -> None:
-        """The stage has changed: the filter follows faster, and older samples of the window will count less."""
-        self.filter.expect_change()
-        self.window.expect_change()
 
     def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, rest: bool) -> bool:
         """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
         ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
         """
-        left_V = pair.u_V - float(basis.dot(self.filter.beta))
+        remainder_V = pair.u_V - float(basis.dot(self.filter.beta))
         said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest)
         if said == "outlier":
             return False
         if not rest:
-            self.window.weigh(kernel_V, left_V, self.filter.step_s)
-        if said == "burst":
-            self.window.expect_change()
-        if self.judgement.valid:
-            self.window.let_go(self.config.before_change)
+            self.window.weigh(kernel_V, remainder_V, self.filter.step_s)
         self.take_rest(pair.u_V, moving=not rest)
         if self.judgement.valid and not rest:
             self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
@@ -299,6 +260,9 @@ class Parts:
         span_V = self.filter.span_V
         j.take(error_V, frozen_error_V, step_s)
         j.decide(c.valid_enter * span_V, c.valid_leave * span_V)
+        looks = j.judged % max(1, round(MARK_S / step_s)) == 0
+        if looks:
+            self.intake.credit = credit_after(self.intake.credit, j.valid)
         before = j.fallback
         self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
         if j.fallen_s > ROLLBACK_S:
@@ -310,44 +274,32 @@ class Parts:
             # If that estimate does not end it either, the next to return to is the identified one.
             self.mark = self.next_mark = self.first
             self.events["rollbacks"] += 1
-        elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
+        elif looks and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
             self.intake.mark_rates()
-            self.mark_ages = (self.mark_ages[1], j.judged)
 
-    def watch_trial(self) -> bool:
-        """Update ``alone`` after a sample; returns whether it has changed."""
-        on_trial_s, before = self.intake.distrusted_s, self.alone
-        if on_trial_s or before:
-            limit_V = MOVES * self.moved_V * max(1.0, on_trial_s / self.moved_s)
-            limit_V = min(limit_V, ALONE_SHARE * self.filter.span_V)
-            known = self.judgement.frozen_V2 <= limit_V * limit_V
-            # A model that may not judge the sensor has confirmed no reading, and so no estimate.
-            self.alone = on_trial_s > 0.0 and (known or self.intake.tried_by_voltages)
-        if self.alone and not before:
-            self.intake.reckon_by(self.intake.base)
-        return self.alone != before
+    def watch_trial(self) -> None:
+        """Readings are on trial: fall back to the identified model where it was good of late.
+
+        A model that may not judge the sensor has confirmed no reading, and so no estimate: there it is served too.
+        """
+        j, intake = self.judgement, self.intake
+        good = j.frozen_V2 <= (IDENTIFIED_SHARE * self.filter.span_V) ** 2
+        if not j.fallback and (good or intake.tried_by_voltages):
+            j.fallback = True
+            intake.reckon_by(intake.base)
 
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
-        move_V = self.rows @ (self.next_mark.beta - self.mark.beta)
-        self.moved_V = sqrt(float(np.mean(move_V**2)))
-        self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s
-        self.window.keep()
         self.events["distrusts"] += 1
 
     def take_jump(self, jump_um: float, first: bool) -> None:
-        """The frame has moved by ``jump_um``, µm; ``first``: see ``Taken``."""
+        """The frame has moved by ``jump_um``, µm; ``first``: see ``IntakeResult``."""
         intake = self.intake
         self.judgement.add_doubt((JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2)
         if first:
-            self._mark_now()
-
-    def _mark_now(self) -> None:
-        """The present estimate is the one to return to."""
-        self.mark = self.next_mark = self.filter.mark()
-        self.mark_ages = (self.judgement.judged,) * 2
+            self.mark = self.next_mark = self.filter.mark()
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -382,7 +334,7 @@ class Parts:
         base = self.intake.base
         j, window, seq = self.judgement, self.window, self.intake.gates.seq
         valid = j.valid and not self.intake.fault
-        if j.fallback or self.alone:
+        if j.fallback:
             return replace(base, noise_variance=j.frozen_short_V2 + self.missing_V2, seq=seq, valid=valid)
         support, alpha, bias = window.arrays()
         beta = self.filter.beta
@@ -435,7 +387,7 @@ class Parts:
     @property
     def ordinary(self) -> bool:
         """Whether samples are learnt in the ordinary way: nothing is in doubt, and nothing is being repaired."""
-        return self.intake.ordinary and not (self.window.heals or self.alone)
+        return self.intake.ordinary and not self.window.heals
 
     # ---- keeping
 
@@ -473,8 +425,7 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     window.with_hyperparameters(window.hyper).newest_error_V(1)
     for moving in (True, False):
         parts.filter.update(basis, 0.0, moving)
-    parts.expect_change()
-    window.let_go(0.5)
+    parts.filter.expect_change()
 
 
 class Learner:
@@ -556,18 +507,20 @@ class Learner:
         if taken.jump_um:
             parts.take_jump(taken.jump_um, taken.first)
             if intake.track is not None and intake.track.features is intake.track.served:
-                parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
-        moved = taken.jump_um or taken.distrusted or taken.renamed
-        # An ordinary sample neither begins nor ends a trial of the sensor.
-        if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
-            self._cache = None
-        if taken.refused == admission.GAP:
+                parts.filter.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
+        falls = parts.judgement.fallback
+        if self.distrusts:
+            parts.watch_trial()
+        elif taken.renamed:  # the trial is over: the learner's own model is served again
+            parts.judgement.fallback = False
+        moved = taken.jump_um or taken.distrusted or taken.renamed or parts.judgement.fallback is not falls
+        if moved or taken.refused == admission.GAP:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
             pair, switched = intake.advance(step)
             if switched:
-                parts.expect_change()
+                parts.filter.expect_change()
             if not taken.refused:
                 outcome = admission.SETTLING if pair is None else self.teach(pair)
         return outcome
@@ -598,10 +551,9 @@ class Learner:
         frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
         served_V = float(self._basis.dot(parts.delay.push(beta)))
         parts.judge(target - served_V, pair.u_V - frozen_V)
-        if pair.now % parts.check_every == 0:
-            found = self._check(pair, target, bool(refused))
-            if found:
-                return found
+        found = self._check(pair, target, bool(refused))
+        if found:
+            return found
         # Where nothing is learnt, the stated deviation is of the errors until now all the same.
         self._cache = None
         if refused:
@@ -635,7 +587,7 @@ class Learner:
         parts, intake = self.parts, self.parts.intake
         kernel_V = pair.u_V - target_V
         p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
-        if saturated or not intake.follow(pair, p_V, parts.check_s):
+        if saturated or not intake.follow(pair, p_V, parts.filter.step_s):
             return ""
         if not intake.distrust(self.snapshot):
             return ""
@@ -677,7 +629,7 @@ class Learner:
     def moving(self) -> MovingPart | None:
         """What has moved since the last snapshot; None where something else than the learnt model is served."""
         parts, intake, j = self.parts, self.parts.intake, self.parts.judgement
-        if j.fallback or parts.alone or intake.track is None or self.trouble or self.distrusts:
+        if j.fallback or intake.track is None or self.trouble or self.distrusts:
             return None
         frame = intake.served
         return MovingPart(
@@ -708,6 +660,15 @@ class Learner:
         if smoothed:
             return (intake.track.frozen_memory if frozen else intake.track.memory).copy()
         return intake.memory_now(frozen)
+
+    @property
+    def lag(self) -> int:
+        """Samples by which the smoothed instant is behind the last sample."""
+        return self.parts.intake.smoother.config.lag
+
+    def smoothed(self) -> tuple[Pair, bool] | None:
+        """The last smoothed instant, and whether the stage moves; None before there is one."""
+        return self.parts.intake.smoothed()
 
     @property
     def features(self) -> FeatureMap:
@@ -821,7 +782,7 @@ class Learner:
             "valid": float(j.valid),
             "fallback": float(j.fallback),
             "frozen": float(self._frozen),
-            "lag_s": intake.smoother.config.lag * base.dt_s,
+            "lag_s": self.lag * base.dt_s,
             "window_y_um": window_y_um.tolist(),
             "window_v_um_per_s": window_v_um_per_s.tolist(),
         }
