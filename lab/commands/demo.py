@@ -107,7 +107,7 @@ def _controlled(summary: dict[str, Any]) -> str:
         f"blocks evaluated by the followed model: {queries['count']}, {times}; its last sample was "
         f"{found['age_p50_ms']:.0f} ms (99 %: {found['age_p99_ms']:.0f} ms) old when a block began; "
         f"{found['late_models']} blocks with an older model than planned, "
-        f"{found['lost']} changes lost and {found['repairs']} repaired; "
+        f"{found['lost']} changes lost; "
         f"{found['extrapolated']} voltages from the reserve of an earlier block"
     )
 
