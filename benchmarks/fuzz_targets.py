@@ -11,13 +11,13 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from benchmarks.forged_states import edited, make_axis, recording
 from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.types import MovingPart
 from dehyst.service.failover.role_control import Claims
 from dehyst.service.operating.verbs import Request, decode_request, encode_request
 from dehyst.service.protocol import delta as wire_delta
@@ -86,19 +86,14 @@ def _framed_checkpoint(data: bytes) -> None:
 
 
 def _changing() -> Target:
-    """A payload of kind 7, taken by a follower's state of a model: decoded, added, and made a model."""
+    """A payload of kind 7, taken by a follower: decoded, and made a model."""
     model = make_models()["lssvm_adaptive"]
-    base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", model, 5, model.rest_memory(1.0)))
-    message = base.message()
+    whole = wire_model.ModelMessage("lssvm_adaptive", model, 5, model.rest_memory(1.0))
 
     def target(data: bytes) -> None:
         with contextlib.suppress(*EXPECTED):
             decoded = wire_delta.decode_delta(data)
-            if decoded.model:
-                wire_delta.FollowedState.decode(decoded.model).message()
-                return
-            after, changed = base.applied(decoded)
-            made = after.message(message, changed)
+            made = wire_delta.moved(whole, decoded)
             if made.snapshot_seq != decoded.snapshot_seq:
                 raise AssertionError("the result has another number than the message")
 
@@ -177,20 +172,12 @@ TARGETS: dict[str, Callable[[], Target]] = {
 
 
 def _changes() -> list[bytes]:
-    """Changes of the small LSSVM: of its linear part, of its kernel part, and a whole model."""
-    old = make_models()["lssvm_adaptive"]
-    assert isinstance(old, LssvmInverse)
-    memory = old.rest_memory(1.0)
-    base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", old, 5, memory))
-    moved = old.moved((0.94, 1.8), old.beta + 0.01, old.domain, 2e-6)
-    grown = replace(moved, support=np.vstack([old.support, old.support[:2] + 0.1]), alpha=np.ones(22))
-    kept = [wire_delta.encode_delta(base.whole())]
-    for model in (moved, grown):
-        state = wire_delta.FollowedState.of(*wire_model.model_parts("lssvm_adaptive", model, memory + 1.0), 9, base)
-        _, message = base.replaced(state)
-        assert message is not None
-        kept.append(wire_delta.encode_delta(message))
-    return kept
+    """Changes of the small LSSVM."""
+    model = make_models()["lssvm_adaptive"]
+    assert isinstance(model, LssvmInverse)
+    memory = model.rest_memory(1.0)
+    part = MovingPart(0.94, 1.8, model.beta + 0.01, model.domain, 2e-6, memory, None)
+    return [wire_delta.encode_delta(seq, 7, part, memory) for seq in (-1, 9)]
 
 
 def seeds(target: str) -> list[bytes]:

@@ -92,7 +92,7 @@ def _controlled(summary: dict[str, Any]) -> str:
         f"blocks evaluated by the followed model: {blocks['count']}, median {blocks['p50_us']:.0f} µs, 99 % within "
         f"{blocks['p99_us']:.0f} µs; its last sample was {found['age_p50_ms']:.0f} ms (99 %: "
         f"{found['age_p99_ms']:.0f} ms) old when a block began; {found['late_models']} blocks with an older model than "
-        f"planned, {found['lost']} changes lost and {found['repairs']} repaired; "
+        f"planned, {found['lost']} changes lost; "
         f"{found['extrapolated']} voltages from the reserve of an earlier block"
     )
 

@@ -112,7 +112,7 @@ class FollowedModels:
         """Figures of the followed model.
 
         ``extrapolated`` : ticks whose voltage was computed with a reserve. ``late_models`` : blocks whose planned model
-        came after them. ``lost``, ``repairs`` : changes that were missing, and whole models fetched for them.
+        came after them. ``lost`` : changes whose whole model was missing.
         ``age_p50_ms``, ``age_p99_ms`` : from the last sample that a block's model had seen to the block's first tick.
         """
         seen = np.array(sorted(self._seen | {-1}))
@@ -122,12 +122,10 @@ class FollowedModels:
             late += best > used
         learnt = np.array([begin - used for begin, _, used in self._used if used >= 0] or [0])
         p50, p99 = np.percentile(learnt * self._plan.dt_s * 1e3, (50, 99)).tolist()
-        changes = self._followers[TEACHER].changes
         return {
             "extrapolated": self._extrapolated,
             "late_models": late,
-            "lost": 0 if changes is None else changes.lost,
-            "repairs": 0 if changes is None else changes.repairs,
+            "lost": self._followers[TEACHER].lost,
             "age_p50_ms": p50,
             "age_p99_ms": p99,
         }

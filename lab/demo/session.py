@@ -267,10 +267,8 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
     for name in MODELS:
         model, seq, memory = axis.model(name)
         payload = encode_model(name, model, seq, memory, axis.safety(name))
-        learns = name == TEACHER
-        followers[name] = Follower(
-            session, "delta" if learns else None, name, payload.__bytes__, axis.limits, deltas=learns, keep=KEPT
-        )
+        key = "delta" if name == TEACHER else None
+        followers[name] = Follower(session, key, name, payload.__bytes__, axis.limits, keep=KEPT)
     models = FollowedModels(plan, followers)
     for run, asked in turns(n // size, ahead):
         if run is not None:

@@ -150,14 +150,14 @@ def claim(endpoint: str, seed: int) -> int:
             tag = "" if len(tokens) % 2 else rng.bytes(TAG).hex()
             again = {real for real in set(claims) if "-rogue" not in real} - told
             told.update(again)
-            for key in (keys.claim(EPOCH + len(tokens), f"i{len(tokens)}-rogue", tag), *again):
+            for key in (keys.token("claim", f"{EPOCH + len(tokens)}/i{len(tokens)}-rogue", tag), *again):
                 tokens.append(session.liveliness().declare_token(key))
 
         for entity in (
             session.declare_queryable(keys.state, see),
             session.declare_queryable(keys.status, alive),
             session.liveliness().declare_subscriber(
-                keys.claim_any, lambda sample: claims.add(str(sample.key_expr)), history=True
+                keys.tokens("claim"), lambda sample: claims.add(str(sample.key_expr)), history=True
             ),
         ):
             stack.callback(entity.undeclare)

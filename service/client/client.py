@@ -590,8 +590,7 @@ class Client:
         deltas = deltas and bool(status.get("delta_hz"))
         of = {learning: keys.model_delta, AUTO: keys.champion_delta} if deltas else {}
         key = (of or {learning: keys.model, AUTO: keys.champion}).get(name)
-        deltas = deltas and key is not None
-        parameters = f"name={name}" + (";changes=1" if deltas else "")
+        parameters = f"name={name}" + (";changes=1" if name in of else "")
         heard = Heard(self._by, key or keys.model)
 
         def read(signed: Signed) -> bytes:
@@ -611,7 +610,6 @@ class Client:
             fetch,
             self.limits,
             memory,
-            deltas=deltas,
             keep=keep,
             heard=heard,
             dt_s=self.dt_s,

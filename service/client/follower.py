@@ -1,13 +1,12 @@
 """A follower: holds the newest state of a model in the caller's process and answers there, without the wire.
 
-It takes whole models, or their changes (`service.protocol.delta`). Of changes, a lost or wrong one is noticed by the
-fingerprints and repaired by fetching the whole model; until then the last good state answers. What does not carry the
-authenticator of the service is passed over, as is a model of another sample time.
+It takes whole models, and changes of them (`service.protocol.delta`). Changes of a whole model that has not come are
+left out, and it is fetched; until then the last good state answers. What does not carry the authenticator of the
+service is passed over, as is a model of another sample time.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -28,7 +27,7 @@ from dehyst.service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_
 from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
 from dehyst.service.answers.which_model import Answering, answering, seen_in, trust_by_age
 from dehyst.service.client.correcting import Answer, Correcting, Motion
-from dehyst.service.protocol.delta import DeltaMessage, FollowedState, decode_delta
+from dehyst.service.protocol.delta import checksum, decode_delta, moved
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.model import ModelMessage, decode_model
 from dehyst.service.protocol.query import (
@@ -41,175 +40,16 @@ from dehyst.service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
-from dehyst.service.protocol.samples import check_seq, column, number, sequence, waiting_time
+from dehyst.service.protocol.samples import DELTA, check_seq, column, number, sequence, waiting_time
 from dehyst.service.security.authenticator import NO_KEY, Heard
 
-_LOGGER: Final = logging.getLogger("dehyst.client")
 #: Voltage below which what fades has faded, V.
 _FADED_V: Final = 1e-9
 
-#: Changes that are kept while a whole model is fetched. Later ones are dropped and need another fetch.
-_KEPT_CHANGES: Final = 1024
-#: Pauses between two fetches of one repair, s: the first, and the longest.
-_PAUSE_S: Final = (0.005, 1.0)
-#: Longest pause before a repair where no change fits the whole models that are fetched, s.
-_FRUITLESS_S: Final = 60.0
 #: How long `Follower.close` waits for a fetch, s.
 _CLOSE_S: Final = 2.0
-#: Pause between two questions who it is that publishes, s.
-_MEET_S: Final = 1.0
-
-
-class Changes:
-    """The sum of a whole model and its changes, with the repair of what is lost.
-
-    Parameters
-    ----------
-    fetch : asks for the whole model. took : takes each new model; raises what makes it unusable.
-
-    Attributes
-    ----------
-    changes, wholes : messages taken. lost : times that a message was missing. mismatches : sums whose fingerprint was
-    not that of the service. repairs : whole models fetched for either. refused : messages that could not be decoded.
-    fruitless : whole models fetched in a row after which no change fitted. One happens by a loss; many mean that this
-    process does not get the numbers of the service. Each doubles the pause before the next, up to a minute, and one
-    warning is logged.
-    """
-
-    def __init__(self, fetch: Callable[[], bytes], took: Callable[[ModelMessage], None]) -> None:
-        self.changes = self.wholes = self.lost = self.mismatches = self.repairs = self.refused = self.fruitless = 0
-        self.last_error = ""
-        self._warned = False
-        self._fetch, self._took = fetch, took
-        self._lock = threading.RLock()
-        self._state: FollowedState | None = None
-        self._model: ModelMessage | None = None
-        # Changes that wait for a whole model; None while none is needed. So it begins.
-        self._waiting: deque[DeltaMessage] | None = deque(maxlen=_KEPT_CHANGES)
-        self._closed = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    @property
-    def fingerprint(self) -> int:
-        """Of the state that answers; 0 before any."""
-        return 0 if self._state is None else self._state.fingerprint
-
-    @property
-    def whole(self) -> bool:
-        """Whether no change is missing."""
-        return self._waiting is None
-
-    def take(self, payload: bytes) -> None:
-        """One message from the wire. Never raises."""
-        with self._lock:
-            try:
-                message = decode_delta(payload)
-            except DehystError as error:
-                self._refuse(error)
-            else:
-                self._take(message)
-
-    def begin(self) -> None:
-        """Fetch the first model. Raises what fetching and decoding raise."""
-        self._join(self._fetch())
-
-    def close(self) -> None:
-        """End a repair that runs."""
-        self._closed.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_CLOSE_S)
-
-    def _take(self, message: DeltaMessage) -> None:
-        """Take a whole model or a change, or begin a repair."""
-        state, changed = self._state, None
-        try:
-            if message.model:
-                after = FollowedState.decode(message.model)
-            elif self._waiting is not None:
-                self._waiting.append(message)
-                return
-            elif state is None or message.before != state.fingerprint:
-                if state is None or message.after != state.fingerprint:  # else it is in a model that was fetched
-                    self.lost += 1
-                    self._repair(message)
-                return
-            else:
-                after, changed = state.applied(message)
-            if after.fingerprint != message.after:
-                self.mismatches += 1
-                self._repair()
-                return
-            self._set(after, after.message(self._model, changed))
-        except DehystError as error:
-            self._refuse(error)
-            return
-        self.wholes, self.changes = self.wholes + (changed is None), self.changes + (changed is not None)
-        self.fruitless, self._waiting = 0, None
-
-    def _set(self, state: FollowedState, model: ModelMessage) -> None:
-        self._took(model)
-        self._state, self._model = state, model
-
-    def _refuse(self, error: DehystError) -> None:
-        self.refused += 1
-        self.last_error = str(error)
-        if self._state is not None:
-            self._repair()
-
-    # ---- repair
-
-    def _repair(self, *kept: DeltaMessage) -> None:
-        """Fetch the whole model in a thread: who delivers the messages must not wait for the wire."""
-        if self._waiting is not None:
-            return
-        self._waiting = deque(kept, maxlen=_KEPT_CHANGES)
-        wait_s = min(_PAUSE_S[0] * 2.0 ** min(self.fruitless, 20), _FRUITLESS_S) if self.fruitless else 0.0
-        if wait_s > _PAUSE_S[1] and not self._warned:
-            self._warned = True
-            self.last_error = (
-                f"fingerprint: got others than those of the service after {self.fruitless} whole models in a row, "
-                f"expected that a change fits; they are fetched ever less often, down to once in {_FRUITLESS_S:.0f} s; "
-                "follow whole models (deltas=False)"
-            )
-            _LOGGER.warning("%s", self.last_error)
-        self._thread = threading.Thread(
-            target=self._fetch_until_joined, args=(wait_s,), name="follower-repair", daemon=True
-        )
-        self._thread.start()
-
-    def _fetch_until_joined(self, wait_s: float) -> None:
-        self._closed.wait(wait_s)
-        pause_s, longest_s = _PAUSE_S
-        this = threading.current_thread()
-        # Another thread where a whole model came meanwhile, and then a gap.
-        while not self._closed.is_set() and self._waiting is not None and self._thread is this:
-            try:
-                if self._join(self._fetch()):
-                    return
-            except DehystError as error:
-                self.last_error = str(error)
-            self._closed.wait(pause_s)
-            pause_s = min(2.0 * pause_s, longest_s)
-
-    def _join(self, payload: bytes) -> bool:
-        """Take a whole model and the changes that waited for it; False where one between them is missing."""
-        fetched = FollowedState.decode(payload)
-        with self._lock:
-            if self._waiting is None:
-                return True
-            self.repairs += self._state is not None
-            self._set(fetched, fetched.message())
-            waiting = list(self._waiting)
-            follows = next((i for i, w in enumerate(waiting) if w.before == fetched.fingerprint), None)
-            # Older changes are in the fetched model already; later ones must follow it.
-            joined = follows is not None or all(w.snapshot_seq <= fetched.snapshot_seq for w in waiting)
-            if not joined:
-                return False
-            self._waiting = None
-            self.fruitless += 1
-            for message in waiting[follows:] if follows is not None else []:
-                self._take(message)
-            return True
+#: Pause between two fetches of the whole model, s.
+_FETCH_S: Final = 1.0
 
 
 class Follower:
@@ -220,7 +60,7 @@ class Follower:
 
     Parameters
     ----------
-    key : where models, or with ``deltas`` their changes, are published; None: the model does not change.
+    key : where models, or their changes, are published; None: the model does not change.
     fetch : asks for the whole model. keep : newest states that `answer` can go back to.
     heard : decides which publications are the service's; None: all. ``fetch`` tells it who answered.
     dt_s : sample time of the axis, s; NaN: that of the first model.
@@ -233,7 +73,7 @@ class Follower:
     limits : of the axis; a client replaces them when the service has others.
     received, refused : counts of models taken, whole or as changes, and of unusable messages.
     last_error : why the last one was refused.
-    changes : counts of the changes, and of lost and repaired ones; None where whole models are followed.
+    lost : count of changes whose whole model had not come.
     last_flags : flags of the last voltage (see :func:`service.protocol.query.flag_names`).
     last_std_V : one standard deviation of the last voltage, V; NaN if the model does not state it or before any answer.
     last_trajectory : the last answer of :meth:`trajectory`, with deviations and stand-in; None before any.
@@ -248,7 +88,6 @@ class Follower:
         limits: Limits,
         memory: ArrayLike | None = None,
         *,
-        deltas: bool = False,
         keep: int = 1,
         heard: Heard | None = None,
         dt_s: float = math.nan,
@@ -258,12 +97,14 @@ class Follower:
         self.name = name
         self._fetch, self._dt_s = fetch, dt_s
         self._heard = heard or Heard(NO_KEY, "")
-        self._meeting: threading.Thread | None = None
-        self._met_s = -math.inf
-        self.received = 0
-        self.changes = Changes(fetch, self._take) if deltas else None
+        self._fetching: threading.Thread | None = None
+        self._fetched_s = -math.inf
+        self.received = self.lost = 0
         self._refused = 0
-        self._last_error = ""
+        self.last_error = ""
+        #: The last whole model, and its checksum.
+        self._whole: tuple[ModelMessage, int] | None = None
+        self._taking = threading.Lock()
         self._moved = threading.Condition()
         self._subscriber: Any = None
         self._newest: tuple[ModelMessage, float]
@@ -272,10 +113,7 @@ class Follower:
             # Subscribe before the first fetch: no snapshot is missed between the two.
             self._subscriber = session.declare_subscriber(key, self._on_model)
         try:
-            if self.changes is not None:
-                self.changes.begin()
-            else:
-                self._take(decode_model(fetch()))
+            self._take_whole(fetch(), before=0)
         except BaseException:
             self.close()
             raise
@@ -307,12 +145,7 @@ class Follower:
     @property
     def refused(self) -> int:
         """Count of messages that could not be used."""
-        return self._refused + self._heard.refused + (0 if self.changes is None else self.changes.refused)
-
-    @property
-    def last_error(self) -> str:
-        """Why the last one could not be used; empty where none was."""
-        return self._last_error or ("" if self.changes is None else self.changes.last_error)
+        return self._refused + self._heard.refused
 
     @property
     def kept(self) -> tuple[int, ...]:
@@ -566,39 +399,53 @@ class Follower:
         if self._subscriber is not None:
             self._subscriber.undeclare()
             self._subscriber = None
-        if self.changes is not None:
-            self.changes.close()
-        if self._meeting is not None and self._meeting is not threading.current_thread():
-            self._meeting.join(_CLOSE_S)
+        if self._fetching is not None and self._fetching is not threading.current_thread():
+            self._fetching.join(_CLOSE_S)
 
     def _on_model(self, sample: zenoh.Sample) -> None:
-        payload = self._heard.take(sample)
-        if payload is None:
-            if self._heard.is_unknown and time.monotonic() - self._met_s >= _MEET_S:
-                self._met_s = time.monotonic()
-                self._meeting = threading.Thread(target=self._meet, name="follower-meets", daemon=True)
-                self._meeting.start()
-        elif self.changes is not None:
-            self.changes.take(payload)
-        else:
-            self._take_whole(payload)
+        payload, known = self._heard.take(sample), not self._heard.is_unknown
+        if payload is not None:
+            try:
+                if payload[1:2] == bytes((DELTA,)):
+                    known = self._take_change(payload)
+                else:
+                    self._take_whole(payload)
+            except DehystError as error:
+                self._refused += 1
+                self.last_error = str(error)
+        fetches = self._fetching is not None and self._fetching.is_alive()
+        if not known and not fetches and time.monotonic() - self._fetched_s >= _FETCH_S:
+            self._fetched_s = time.monotonic()
+            self._fetching = threading.Thread(target=self._fetch_whole, name="follower-fetches", daemon=True)
+            self._fetching.start()
 
-    def _meet(self) -> None:
-        """Somebody else publishes, by the same key: ask who serves now, and take its model."""
+    def _fetch_whole(self) -> None:
+        """A whole model was lost, or somebody else publishes, by the same key: ask who serves now."""
         try:
-            payload = self._fetch()
+            before = self.received
+            self._take_whole(self._fetch(), before)
         except DehystError as error:
-            self._last_error = str(error)
-            return
-        if self.changes is None:  # of changes, the next one shows that some are missing
-            self._take_whole(payload)
+            self.last_error = str(error)
 
-    def _take_whole(self, payload: bytes) -> None:
-        try:
-            self._take(decode_model(payload))
-        except DehystError as error:
-            self._refused += 1
-            self._last_error = str(error)
+    def _take_whole(self, payload: bytes, before: int | None = None) -> None:
+        """Take a whole model, unless others have come since there were ``before``: the newest counts."""
+        message = decode_model(payload)
+        with self._taking:
+            if before in (None, self.received):
+                self._take(message)
+                self._whole = message, checksum(payload)
+
+    def _take_change(self, payload: bytes) -> bool:
+        """Take a change of the last whole model; one of another is left out, and False returned."""
+        change = decode_delta(payload)
+        with self._taking:
+            if self._whole is None:
+                return True  # the first one is being fetched
+            if change.base != self._whole[1]:
+                self.lost += 1
+                return False
+            self._take(moved(self._whole[0], change))
+        return True
 
     def _take(self, message: ModelMessage) -> None:
         if message.name != self.name:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import secrets
@@ -22,7 +23,7 @@ from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
 from dehyst.adaptive.fleet.snapshot import FleetSnapshot
 from dehyst.adaptive.fleet.state import OUTCOMES
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.types import BoolArray, FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray, MovingPart
 from dehyst.service.answers.guard import Limits, limit
 from dehyst.service.config.learner import learner_config
 from dehyst.service.config.settings import LEARN, ServeConfig
@@ -32,10 +33,10 @@ from dehyst.service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encod
 from dehyst.service.operating.server import FREEZE, THAW, Journal, OperationsServer
 from dehyst.service.operating.verbs import Outcome, Request, take
 from dehyst.service.protocol.container import JSON, fields_of, to_json
-from dehyst.service.protocol.delta import FollowedState, encode_delta
+from dehyst.service.protocol.delta import checksum, encode_delta
 from dehyst.service.protocol.errors import FieldError, ServiceError
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.protocol.model import model_parts
+from dehyst.service.protocol.model import encode_model
 from dehyst.service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
 from dehyst.service.runtime.session import open_service
 from dehyst.service.security.authenticator import HeardSamples
@@ -52,8 +53,8 @@ _WORST, _STATUS_S = 10, 1.0
 #: Returns axes to their checkpoints. Most axes that are written before an operator is answered.
 ROLLBACK: Final = "rollback"
 _WRITTEN_AT_ONCE: Final = 16
-#: Most axes whose models are followed at a time.
-_MOST_FOLLOWED: Final = 64
+#: Most axes whose models are followed at a time, and time between two whole models of one, s.
+_MOST_FOLLOWED, _WHOLE_S = 64, 1.0
 
 
 def load_fleet(settings: FleetSettings) -> Fleet:
@@ -120,6 +121,32 @@ def _limit_all(
         limit(u[b], inside[b], before[b], low_V, high_V, step_V, flags[b])
 
 
+class _Followed:
+    """The model of one axis for those that follow it. ``lately`` : whether somebody subscribed at the last look.
+
+    ``whole`` : payload of the last whole model, which changes are of.
+    """
+
+    def __init__(self, publisher: Any) -> None:
+        self.publisher, self.lately, self.whole = publisher, True, b""
+        self._whole_s, self._seq, self._bias_V = -math.inf, -1, 0.0
+
+    def next(self, model: LssvmInverse, memory: FloatArray, part: MovingPart | None, now_s: float) -> bytes:
+        """What followers get of a model at ``now_s`` (``time.monotonic``); empty where nothing is new."""
+        if part is None or now_s - self._whole_s >= _WHOLE_S:
+            whole = encode_model(LEARN, model, model.seq, memory)
+            if whole == self.whole:
+                return b""
+            self.whole, self._whole_s, self._seq = whole, now_s, model.seq
+            self._bias_V = 0.0 if part is None else float(model.beta[0] - part.beta[0])
+            return whole
+        if model.seq == self._seq:
+            return b""
+        self._seq = model.seq
+        part.beta[0] += self._bias_V
+        return encode_delta(model.seq, checksum(self.whole), part, memory)
+
+
 class FleetService:
     """A running fleet; use as a context manager. The thread ``learn-fleet`` owns the fleet."""
 
@@ -145,8 +172,8 @@ class FleetService:
             self._checkpoints.restore(range(self.settings.axes))
         self._renew(-1)
         self._published = self._newest[0].linear
-        #: The axes that are followed: publisher, state, and whether somebody subscribed lately.
-        self._followed: dict[int, tuple[Any, FollowedState, bool]] = {}
+        #: The axes that are followed.
+        self._followed: dict[int, _Followed] = {}
         self._session: Any = None
         self._queue: queue.Queue[FleetMessage | Callable[[], None]] = queue.Queue()
         self._counts = dict.fromkeys(_COUNTED, 0)
@@ -304,24 +331,27 @@ class FleetService:
             publisher.put(changes, attachment=self._by.published(self.keys.model, changes))
 
     def _publish_followed(self) -> None:
-        """Send what has changed of the models of single axes to those that follow them."""
+        """Send what has moved in the models of single axes to those that follow them, now and then a whole model."""
         memory = self._fleet.memory() if self._followed else None
-        for axis, (publisher, before, lately) in list(self._followed.items()):
-            follows = publisher.matching_status.matching
+        for axis, followed in list(self._followed.items()):
+            follows = followed.publisher.matching_status.matching
             # Just after it was declared, a publisher may not know of its subscribers yet.
-            if not (follows or lately):
-                publisher.undeclare()
+            if not (follows or followed.lately):
+                followed.publisher.undeclare()
                 del self._followed[axis]
                 continue
-            now, message = before.replaced(self._state_of(axis, memory, before))
-            self._followed[axis] = publisher, now, follows
-            if message is not None:
-                payload, key = encode_delta(message), f"{self.keys.model_delta}/{axis}"
-                publisher.put(payload, attachment=self._by.published(key, payload))
+            followed.lately = follows
+            payload, key = (
+                followed.next(*self._state_of(axis, memory), time.monotonic()),
+                f"{self.keys.model_delta}/{axis}",
+            )
+            if payload:
+                followed.publisher.put(payload, attachment=self._by.published(key, payload))
 
-    def _state_of(self, axis: int, memory: Any, like: FollowedState | None = None) -> FollowedState:
-        model = self._fleet.model_of(axis)
-        return FollowedState.of(*model_parts(LEARN, model, memory[axis]), model.seq, like)
+    def _state_of(self, axis: int, memory: Any) -> tuple[LssvmInverse, FloatArray, MovingPart | None]:
+        """(model as it is served, its memory, what moves in it, None for one that is held)."""
+        held, learner = self._fleet.held.get(axis), self._fleet.learner_of(axis)
+        return held or learner.snapshot(), memory[axis], None if held else learner.moving()
 
     def _checked(self, axis: object, field: str) -> int:
         if isinstance(axis, bool) or not isinstance(axis, int) or not 0 <= axis < self.settings.axes:
@@ -329,17 +359,20 @@ class FleetService:
         return axis
 
     def _model(self, payload: bytes) -> bytes:
-        """The whole model of an axis; with "changes" the one that the next change changes."""
+        """The whole model of an axis; with "changes" the one that the next changes are of."""
         fields = fields_of(payload)
         axis = self._checked(fields.get("axis"), "axis")
-        if axis not in self._followed or not fields.get("changes"):
-            state = self._state_of(axis, self._fleet.memory())
+        followed = self._followed.get(axis)
+        if followed is None or not fields.get("changes"):
+            model, memory, _ = state = self._state_of(axis, self._fleet.memory())
             if not fields.get("changes"):
-                return state.payload()
+                return encode_model(LEARN, model, model.seq, memory)
             if len(self._followed) >= _MOST_FOLLOWED:
                 raise ServiceError(f"{_MOST_FOLLOWED} axes are followed already: ask for whole models, or later")
-            self._followed[axis] = self._session.declare_publisher(f"{self.keys.model_delta}/{axis}"), state, True
-        return self._followed[axis][1].payload()
+            followed = _Followed(self._session.declare_publisher(f"{self.keys.model_delta}/{axis}"))
+            followed.next(*state, time.monotonic())
+            self._followed[axis] = followed
+        return followed.whole
 
     def _status_reply(self, payload: bytes) -> bytes:
         axis = fields_of(payload).get("axis")

@@ -112,15 +112,6 @@ class Keys:
         """Query of the instance that serves, which its standbys answer: the newest freeze or thaw, JSON."""
         return f"{self.base}/switch"
 
-    @property
-    def claim_any(self) -> str:
-        """Matches the claims of all instances that serve this axis."""
-        return self.tokens("claim")
-
-    def claim(self, epoch: int, instance: str, tag: str = "") -> str:
-        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence."""
-        return self.token("claim", f"{epoch}/{instance}", tag)
-
     def tokens(self, kind: str) -> str:
         """Matches the liveliness tokens of one kind, see `service.security.tokens`."""
         return f"{self.base}/{kind}/**"

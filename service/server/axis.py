@@ -553,6 +553,7 @@ class Axis:
         """Stop learning and keep what is served to the last bit; samples are still tracked, judged and recorded."""
         self.supervisor.freeze(by or "operator")
         self._snapshots = (*self._snapshots[:-1], self.newest.freeze())
+        self.moves.end()
         self.note("frozen", "learning is stopped", by=by)
         return self.handled_seq
 
@@ -588,6 +589,7 @@ class Axis:
         }
         served = replace(newest, models=newest.models | changed, memories=newest.memories | memories)
         self._snapshots = (*self._snapshots[:-1], served)
+        self.moves.end()
         self.note("rolled_back", f"to checkpoint {checkpoint}", by=by, checkpoint=checkpoint)
         return self.handled_seq
 
@@ -637,6 +639,7 @@ class Axis:
         self.sequence, self.clock, self.tracker, self.supervisor = sequence, clock, tracker, supervisor
         self._gates = own.gates
         self._snapshots = (served,)
+        self.moves.end()
         self.handled_seq = own.seq
         self._update_counts()
 

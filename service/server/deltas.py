@@ -1,6 +1,7 @@
 """Publishes the changes of the models that learn, for followers (docs/protocol.md, "Model changes").
 
-The thread that handles samples copies what moves (`service.server.moves`); the publishing thread makes the messages.
+The thread that handles samples decides when a whole model is due, and copies what moves between two
+(`service.server.moves`); the publishing thread makes the messages.
 """
 
 from __future__ import annotations
@@ -12,32 +13,29 @@ from typing import Final
 
 from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.service.answers.answering import Served
-from dehyst.service.protocol.delta import DeltaMessage, FollowedState, doubles, encode_delta
-from dehyst.service.protocol.keys import AUTO
-from dehyst.service.protocol.model import model_parts
+from dehyst.service.protocol.delta import checksum, encode_delta
+from dehyst.service.protocol.model import encode_model
 from dehyst.service.server.axis import Axis
-from dehyst.service.server.moves import Move
+from dehyst.service.server.moves import Move, same_choice
 
 #: Interval of the check for followers, s.
 _LOOK_S: Final = 0.05
+#: Pause between two whole models where nothing moves between them, s.
+_PAUSE_S: Final = 0.1
 
 
 @dataclass(slots=True)
 class _Stream:
-    """The changes of one model. ``served`` : the snapshot whose kernel part ``state`` has."""
+    """The changes of one model. ``base``, ``payload`` : the snapshot that was sent as a whole, and how; None, b"" while
+    nobody follows. ``moved`` : whether moves of it were sent."""
 
     name: str
     put: Callable[[bytes], None]
     followed: Callable[[], bool]
-    state: FollowedState | None = None
-    served: Served | None = None
+    base: Served | None = None
+    payload: bytes = b""
+    moved: bool = False
     sent_at_s: float = -math.inf
-
-    def send(self, change: tuple[FollowedState, DeltaMessage | None]) -> None:
-        # First the state: a follower that gets the change may ask at once for a model that has it.
-        self.state, message = change
-        if message is not None:
-            self.put(encode_delta(message))
 
 
 class DeltaStreams:
@@ -55,67 +53,62 @@ class DeltaStreams:
     def close(self) -> None:
         """Publish no longer."""
         self._streams = {}
-        self._axis.moves.want(frozenset())
+        self._axis.moves.want(False)
 
-    def payload(self, name: str) -> bytes | None:
-        """The whole model that the next change changes; None where no changes are published. From any thread."""
+    def payload(self, name: str) -> bytes:
+        """The whole model that the next changes are of; empty where no changes are published. From any thread."""
         stream = self._streams.get(name)
-        state = None if stream is None else stream.state
-        return None if state is None else state.payload()
+        return b"" if stream is None else stream.payload
 
     def tick(self, now_s: float) -> None:
         """Publish what has changed at ``now_s`` (``time.monotonic``)."""
+        # In this order: the moves of an earlier base are among those that are drained.
+        base = self._axis.moves.base
+        moves = self._axis.moves.drain()
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
-            self._look()
-        moves = self._axis.moves.drain()
-        newest = self._axis.newest
+            self._look(now_s)
         for stream in self._streams.values():
-            if stream.state is None:
+            newest = self._axis.newest
+            if stream.base is None:
                 continue
-            for move in moves:
-                if move.served is stream.served:
-                    stream.send(stream.state.changed(self._entries(stream.name, move), move.seq))
-            if newest is not stream.served and now_s - stream.sent_at_s >= 0.5 / self._axis.config.delta_hz:
-                stream.served, stream.sent_at_s = newest, now_s
-                later = [move for move in moves if move.served is newest]
-                state = self._snapshot(stream, newest)
-                if later:  # one message for the snapshot and the first move from it
-                    state = state.changed(self._entries(stream.name, later[0]), later[0].seq)[0]
-                stream.send(stream.state.replaced(state))
-                for move in later[1:]:
-                    stream.send(stream.state.changed(self._entries(stream.name, move), move.seq))
+            if base is not None and self._moves(stream, base):
+                for move in moves:
+                    self._send_move(stream, move, now_s)
+                if not moves:
+                    self._send_whole(stream, base, now_s)
+            elif stream.moved or now_s - stream.sent_at_s >= _PAUSE_S or not same_choice(newest, stream.base):
+                self._send_whole(stream, newest, now_s)
 
-    def _look(self) -> None:
+    def _look(self, now_s: float) -> None:
         """Begin the streams that have followers now, and end those that have none."""
         for stream in self._streams.values():
             followed = stream.followed()
-            if followed and stream.served is None:
-                stream.served = newest = self._axis.newest
-                stream.send((state := self._snapshot(stream, newest), state.whole()))
+            if followed and stream.base is None:
+                self._send_whole(stream, self._axis.moves.base or self._axis.newest, now_s)
             elif not followed:
-                stream.state = stream.served = None
-        self._axis.moves.want(frozenset(name for name, stream in self._streams.items() if stream.served is not None))
+                stream.base, stream.payload = None, b""
+        self._axis.moves.want(any(stream.base is not None for stream in self._streams.values()))
 
-    def _snapshot(self, stream: _Stream, served: Served) -> FollowedState:
+    def _send_whole(self, stream: _Stream, served: Served, now_s: float) -> None:
+        if served is stream.base:
+            return
         model, seq, memory = self._axis.model(stream.name, served)
-        parts = model_parts(stream.name, model, memory, self._axis.safety(stream.name, served))
-        return FollowedState.of(*parts, seq, stream.state)
+        payload = encode_model(stream.name, model, seq, memory, self._axis.safety(stream.name, served))
+        # First the state: a follower that gets a change may ask at once for the model that it is of.
+        stream.base, stream.payload, stream.moved, stream.sent_at_s = served, payload, False, now_s
+        stream.put(payload)
 
-    def _entries(self, name: str, move: Move) -> dict[str, bytes]:
-        """What ``move`` changes; nothing in a champion that is another model than the one that learns."""
-        part, learn, memory, prefix = move.part, self._axis.config.learn, move.part.memory, ""
-        if name == AUTO:
-            champion = move.served.models[AUTO]
-            if not isinstance(champion, ChampionInverse) or champion.names[champion.champion] != learn:
-                return {}
-            # The other contestants' memories stay those of the snapshot: to track them too costs as much as learning.
-            memory, prefix = champion.with_memory(move.served.memories[AUTO], learn, memory), f"{learn}."
-        return {
-            f"{prefix}features.gain": doubles(part.gain),
-            f"{prefix}features.offset_um": doubles(part.offset_um),
-            f"{prefix}beta": doubles(part.beta),
-            f"{prefix}domain": doubles(part.domain),
-            f"{prefix}noise_variance": doubles(part.noise_variance),
-            "/memory": doubles(memory),
-        }
+    def _moves(self, stream: _Stream, base: Served) -> bool:
+        """Whether what moves is in this model: not in a champion that is another one than learns."""
+        model = base.models[stream.name]
+        return not isinstance(model, ChampionInverse) or model.names[model.champion] == self._axis.config.learn
+
+    def _send_move(self, stream: _Stream, move: Move, now_s: float) -> None:
+        self._send_whole(stream, move.base, now_s)
+        model, memory = move.base.models[stream.name], move.part.memory
+        if isinstance(model, ChampionInverse):
+            # The other contestants' memories stay those of the whole model: to track them costs as much as learning.
+            memory = model.with_memory(move.base.memories[stream.name], self._axis.config.learn, memory)
+        stream.moved = True
+        stream.put(encode_delta(move.seq, checksum(stream.payload), move.part, memory))

@@ -8,20 +8,18 @@ depend on the processor. docs/protocol.md ("Test vectors") describes the files.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.adaptive.types import FloatArray, InverseModel, MovingPart
 from dehyst.baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
 from dehyst.baselines.common import Domain
 from dehyst.baselines.competition.champion import ChampionInverse
@@ -33,9 +31,9 @@ from dehyst.service.client.correcting import Correcting
 from dehyst.service.config.correction import CorrectionConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
-from dehyst.service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
+from dehyst.service.protocol.delta import checksum, encode_delta
 from dehyst.service.protocol.keys import AUTO, Keys
-from dehyst.service.protocol.model import Safety, check_model, encode_model
+from dehyst.service.protocol.model import Safety, encode_model
 from dehyst.service.protocol.query import Pending, Trajectory, decode_query, encode_query, encode_reply
 from dehyst.service.protocol.samples import (
     COMMAND,
@@ -319,23 +317,17 @@ def cases() -> list[Case]:
 # --- Changes of a followed model: a base and what comes after it, in order.
 
 
-@dataclass(frozen=True)
-class Step:
-    """One message to a follower of changes. ``message``: "fetched" (kind 6) or "change" (kind 7)."""
+class Step(NamedTuple):
+    """One message to a follower of changes. ``message``: "fetched" or "change"; ``base``, ``seq`` : checksum of the
+    whole model, and last sample, of the model that the follower has afterwards."""
 
     name: str
     message: str
     payload: bytes
     outcome: str
-    after: FollowedState
+    base: int
+    seq: int
     reply: bytes = b""
-
-
-def _sent(before: FollowedState, payload: bytes) -> tuple[FollowedState, DeltaMessage]:
-    """(the state of a model payload, the message that leads there)."""
-    after, message = before.replaced(FollowedState.of(*check_model(payload), like=before))
-    assert message is not None
-    return after, message
 
 
 def delta_query() -> bytes:
@@ -344,89 +336,80 @@ def delta_query() -> bytes:
 
 
 def delta_steps() -> list[Step]:
-    """A stage whose gain drops, then a change of the kernel part; a loss, a wrong sum, and what is refused."""
+    """A stage whose gain drops, whole models in between; changes of other whole models, and what is refused."""
     rng = np.random.default_rng(SEED + 1)
     learnt = lssvm(rng, feature_map(3, (3.0, 9.0), (0.1, 1.0, 10.0), (0, 2)), 40, True)
     learnt = replace(learnt, beta_covariance=np.empty((0, 0)))
 
-    def auto(model: LssvmInverse, seq: int, trust: float = 1.0) -> Snapshot:
-        champion = ChampionInverse((LEARNING, "linear", "mpi", "bouc_wen"), (model, LINE, MPI, BOUC_WEN), 0, 0.02)
-        # Plain arithmetic: the fingerprints are the same on every machine.
-        memory = np.concatenate(([1.0, 0.0, 0.0, 0.0], 5.0 + 0.125 * np.arange(champion.memory_size - 4)))
+    def auto(model: LssvmInverse, seq: int, trust: float = 1.0, champion: int = 0) -> Snapshot:
+        made = ChampionInverse((LEARNING, "linear", "mpi", "bouc_wen"), (model, LINE, MPI, BOUC_WEN), champion, 0.02)
+        # Plain arithmetic: the checksums are the same on every machine.
+        memory = np.concatenate((np.eye(4)[champion], 5.0 + 0.125 * np.arange(made.memory_size - 4)))
         memory[4:] += (seq - 4000) / 64.0
-        return Snapshot("deltas", AUTO, champion, seq, MPI, trust, AUTO, memory=memory)
+        return Snapshot("deltas", AUTO, made, seq, MPI, trust, AUTO, memory=memory)
+
+    def learning(now: Snapshot) -> LssvmInverse:
+        assert isinstance(now.model, ChampionInverse)
+        model = now.model.models[0]
+        assert isinstance(model, LssvmInverse)
+        return model
+
+    def change(whole: Snapshot, now: Snapshot, **wrong: Any) -> bytes:
+        model, served = learning(now), now.served()
+        frame, memory = model.features, wrong.pop("memory", served.memories[AUTO])
+        part = MovingPart(frame.gain, frame.offset_um, model.beta, model.domain, model.noise_variance, memory, None)
+        return encode_delta(now.seq, checksum(whole.payload()), part._replace(**wrong), memory)
 
     def moved(model: LssvmInverse, gain: float, offset_um: float) -> LssvmInverse:
         beta = model.beta + rng.uniform(-1e-3, 1e-3, model.beta.size)
         frame = {"gain": gain, "offset_um": offset_um}
         return replace(in_frame(model, frame), beta=beta, noise_variance=model.noise_variance * 1.25)
 
+    base = auto(learnt, 4000)
+    frame = auto(moved(learnt, 0.98, 0.4), 4005)
+    linear = auto(moved(learnt, 0.94, 1.8), 4010)
     grown = np.concatenate([learnt.support, rng.uniform(-1.2, 1.2, (2, 4))])
     grown[[3, 17]] = rng.uniform(-1.2, 1.2, (2, 4))
-    first = moved(learnt, 0.98, 0.4)
-    second = replace(moved(first, 0.94, 1.8), support=grown, alpha=rng.uniform(-0.4, 0.4, 42), gamma=300.0)
-    models = [learnt, first, second]
-    for gain in (0.941, 0.942, 0.943, 0.944, 0.945, 0.946):
-        models.append(moved(models[-1], gain, 1.8))
-    snapshots_of = [auto(model, 4000 + 5 * k, 0.7 if k == 2 else 1.0) for k, model in enumerate(models)]
-    payloads = [snapshot.payload() for snapshot in snapshots_of]
-    states = [FollowedState.decode(payloads[0])]
-    changes = [b""]
-    for payload in payloads[1:]:
-        state, message = _sent(states[-1], payload)
-        states.append(state)
-        changes.append(encode_delta(message))
+    second = replace(moved(learnt, 0.94, 1.8), support=grown, alpha=rng.uniform(-0.4, 0.4, 42), gamma=300.0)
+    kernel = auto(second, 4020, 0.7)
+    after_kernel = auto(moved(second, 0.941, 1.8), 4025, 0.7)
+    missed = auto(moved(second, 0.942, 1.8), 4040)
+    after_missed = auto(moved(learning(missed), 0.943, 1.8), 4045)
+    last = auto(moved(learning(missed), 0.944, 1.8), 4050)
+    frozen = auto(replace(learnt, beta_covariance=1e-6 * np.eye(learnt.beta.size), noise_variance=2e-6), 4100)
+    other = auto(learnt, 4120, champion=1)
     query = delta_query()
 
-    def reply(k: int) -> bytes:
-        return encode_reply(snapshots_of[k].answer(query, math.nan))
+    def taken(name: str, now: Snapshot, whole: Snapshot, message: str = "change") -> Step:
+        payload = now.payload() if now is whole else change(whole, now)
+        reply = encode_reply(now.answer(query, math.nan))
+        return Step(name, message, payload, "taken", checksum(whole.payload()), now.seq, reply)
 
-    def taken(name: str, k: int) -> Step:
-        return Step(name, "change", changes[k], "taken", states[k], reply(k))
+    def left(name: str, payload: bytes, outcome: str, now: Snapshot, whole: Snapshot) -> Step:
+        return Step(name, "change", payload, outcome, checksum(whole.payload()), now.seq)
 
-    def fetched(name: str, k: int, then: int) -> Step:
-        return Step(name, "fetched", payloads[k], "taken", states[then], reply(then))
-
-    def bad(name: str, change: Change, now: int) -> list[Step]:
-        """A change that does not fit the model, and the repair of it."""
-        message = DeltaMessage(5000, states[now].fingerprint, 1, (change,))
-        with contextlib.suppress(InputError):  # the sum exists, and is right, but is no model
-            message = replace(message, after=states[now].applied(message)[0].fingerprint)
-        again = Step(f"after-{name}", "fetched", payloads[now], "taken", states[now])
-        return [Step(name, "change", encode_delta(message), "refused", states[now]), again]
-
-    wrong = bytearray(changes[7])
-    wrong[-1] ^= 0x40  # a bit of the last double
-    frozen = replace(learnt, beta_covariance=1e-6 * np.eye(learnt.beta.size), noise_variance=2e-6)
-    whole = auto(frozen, 4100)
-    changed_form = FollowedState.decode(whole.payload())
-    names = changed_form.names
-    beta, alpha, support = (names.index(f"{LEARNING}.{name}") for name in ("beta", "alpha", "support"))
-    pair = doubles(np.zeros(2))
-    steps = [
-        Step("base", "fetched", payloads[0], "taken", states[0], reply(0)),
-        taken("frame", 1),
-        taken("kernel", 2),
-        taken("linear", 3),
-        Step("gap", "change", changes[5], "lost", states[3], reply(3)),
-        Step("waiting", "change", changes[6], "waits", states[3]),
-        fetched("repaired", 5, 6),
-        Step("again", "change", changes[6], "known", states[6]),
-        Step("wrong", "change", bytes(wrong), "mismatch", states[6], reply(6)),
-        fetched("mended", 7, 7),
-        taken("last", 8),
-        *bad("entry", Change(len(names), 1, 0, doubles(0.0)), 8),
-        *bad("half-a-row", Change(support, 170, 168, pair), 8),
-        *bad("hole", Change(alpha, 45, 43, pair), 8),
-        *bad("scalar", Change(names.index("champion"), 2, 0, pair), 8),
-        *bad("no-index", Change(names.index("champion"), 1, 0, doubles(0.5)), 8),
-        *bad("not-finite", Change(beta, learnt.beta.size, 0, doubles(np.full(learnt.beta.size, math.nan))), 8),
-        Step(
-            "whole", "change", encode_delta(changed_form.whole()), "taken", changed_form,
-            encode_reply(whole.answer(query, math.nan)),
-        ),
-    ]  # fmt: skip
-    return steps
+    beta = learnt.beta
+    wrong: dict[str, dict[str, Any]] = {
+        "linear-part": {"beta": beta[:-1]},
+        "memory": {"memory": np.zeros(3)},
+        "not-finite": {"beta": np.full(beta.size, math.nan)},
+        "noise": {"noise_variance": -1e-6},
+    }
+    return [
+        taken("base", base, base, "fetched"),
+        taken("frame", frame, base),
+        taken("linear", linear, base),
+        taken("kernel", kernel, kernel),
+        left("older", change(base, linear), "lost", kernel, kernel),
+        taken("after-kernel", after_kernel, kernel),
+        left("gap", change(missed, after_missed), "lost", after_kernel, kernel),
+        taken("repaired", missed, missed, "fetched"),
+        taken("last", last, missed),
+        *(left(name, change(missed, last, **fields), "refused", last, missed) for name, fields in wrong.items()),
+        taken("whole", frozen, frozen),
+        taken("champion", other, other),
+        left("nothing-moves", change(other, other), "refused", other, other),
+    ]
 
 
 # --- Files.
@@ -440,7 +423,8 @@ def refused() -> dict[str, tuple[bytes, int, str]]:
     samples = encode_samples([5], [0.005], [1.0], [11.0])
     model = snapshots()["linear"].payload()
     nan = struct.pack("<d", math.nan)
-    delta = encode_delta(DeltaMessage(4, 7, 8, (Change(3, 2, 0, doubles(np.array([1.0, 2.0]))),)))
+    part = MovingPart(1.0, 0.0, np.array([1.0, 2.0]), np.arange(6.0), 1e-6, np.array([3.0]), None)
+    delta = encode_delta(4, 7, part, part.memory)
     return {
         "version": (b"\x02" + good[1:], FEEDFORWARD_QUERY, "version"),
         "kind": (b"\x01\x05" + good[2:], FEEDFORWARD_QUERY, "kind"),
@@ -465,12 +449,10 @@ def refused() -> dict[str, tuple[bytes, int, str]]:
         "delta-options": (delta[:2] + b"\x02" + delta[3:], DELTA, "options"),
         "delta-n": (delta[:4] + bytes(4) + delta[8:], DELTA, "n"),
         "delta-seq": (delta[:8] + struct.pack("<q", -2) + delta[16:], DELTA, "snapshot_seq"),
-        "delta-size": (delta[:28] + struct.pack("<I", 2**23 + 1) + delta[32:], DELTA, "change[0].size"),
-        "delta-k": (delta[:32] + struct.pack("<I", 1) + delta[36:], DELTA, "change[0].k"),
+        "delta-m": (delta[:20] + struct.pack("<I", 4097) + delta[24:], DELTA, "m"),
+        "delta-values": (delta[:24] + nan + delta[32:], DELTA, "values[0]"),
         "delta-short": (delta[:-1], DELTA, "payload"),
         "delta-long": (delta + bytes(8), DELTA, "payload"),
-        "delta-missing": (delta[:4] + struct.pack("<I", 2) + delta[8:], DELTA, "payload"),
-        "delta-whole": (delta[:2] + b"\x01" + delta[3:], DELTA, "before"),
     }
 
 
@@ -647,15 +629,14 @@ def write(out: Path) -> int:
             values = np.ravel(given).tolist()
             table += [f"fleet-{name}.payload {key} {i} {float(value)!r}" for i, value in enumerate(values)]
     files["fleet.txt"] = ("\n".join(table) + "\n").encode()
-    table = ["# step message file outcome fingerprint snapshot_seq"]
+    table = ["# step message file outcome base snapshot_seq"]
     files["deltas.query.payload"] = delta_query()
     for step in delta_steps():
         file = f"deltas-{step.name}.{step.message}.payload"
         files[file] = step.payload
         if step.reply:
             files[f"deltas-{step.name}.reply.payload"] = step.reply
-        after = step.after
-        table.append(f"{step.name} {step.message} {file} {step.outcome} {after.fingerprint:08x} {after.snapshot_seq}")
+        table.append(f"{step.name} {step.message} {file} {step.outcome} {step.base:08x} {step.seq}")
     files["deltas.txt"] = ("\n".join(table) + "\n").encode()
     table = ["# file kind field"]
     for name, (payload, kind, at) in refused().items():

@@ -63,11 +63,10 @@ const char *dehyst_error(void);
 /* A handle from the payload of `.../model` (kind 6) and the limits. */
 int dehyst_open_payload(const uint8_t *payload, size_t bytes, const dehyst_limits *limits, dehyst **handle);
 
-/* A newer payload of the same model, from any thread: a whole model (kind 6, of `.../model`) or changes (kind 7, of
- * `.../model_delta` or `.../champion_delta`). Refused payloads are counted and change nothing. Returns 1
- * (DEHYST_WHOLE_NEEDED) where a change is missing or a sum is wrong. After that, and after a refused change: query
- * `.../model?name=NAME;changes=1` and give the answer to this function, until it returns 0. Changes that come meanwhile
- * are kept. */
+/* A newer payload of the same model, from any thread: a whole model (kind 6) or a change (kind 7), of `.../model`,
+ * `.../model_delta` or `.../champion_delta`. Refused payloads are counted and change nothing. Returns 1
+ * (DEHYST_WHOLE_NEEDED) where the whole model of a change has not come: query `.../model?name=NAME;changes=1` and give the
+ * answer to this function, unless a whole model comes before. */
 #define DEHYST_WHOLE_NEEDED 1
 int dehyst_update(dehyst *handle, const uint8_t *payload, size_t bytes);
 

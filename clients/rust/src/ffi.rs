@@ -79,7 +79,7 @@ pub struct CReport {
 const OK: c_int = 0;
 const REFUSED: c_int = -1;
 const INTERNAL: c_int = -2;
-/// Of `dehyst_update`: a change is missing.
+/// Of `dehyst_update`: the whole model of a change is missing.
 const WHOLE_NEEDED: c_int = 1;
 
 thread_local! {
@@ -188,7 +188,7 @@ pub unsafe extern "C" fn dehyst_update(handle: *mut Handle, payload: *const u8, 
     let status = guarded(|| {
         let handle = handle.as_ref().ok_or_else(|| missing("handle"))?;
         let update = handle.publisher.update(read(payload, bytes, "payload")?)?;
-        needed = matches!(update, Update::Lost | Update::Mismatch);
+        needed = update == Update::Lost;
         Ok(())
     });
     if status == OK && needed {

@@ -73,8 +73,8 @@ impl Publisher {
         self.update(payload).map(drop)
     }
 
-    /// The same for a whole model (kind 6) or for changes (kind 7). `Lost`, `Mismatch` and an error of a change say that
-    /// a whole model must be fetched (`.../model?name=...;changes=1`) and given to this function.
+    /// The same for a whole model (kind 6) or for a change (kind 7). `Lost` says that the whole model of the change must
+    /// be fetched (`.../model?name=...;changes=1`) and given to this function, unless one comes by itself.
     pub fn update(&self, payload: &[u8]) -> Result<Update> {
         let mut feeding = self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
         let taken = feeding.changes.take(payload).and_then(|(update, snapshot)| match &snapshot {
@@ -106,9 +106,9 @@ impl Publisher {
         }
     }
 
-    /// Fingerprint of the newest model, as in the payloads of kind 7.
-    pub fn fingerprint(&self) -> u32 {
-        self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).changes.fingerprint()
+    /// Checksum of the newest whole model, as in the payloads of kind 7.
+    pub fn base(&self) -> u32 {
+        self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).changes.base()
     }
 
     /// Why the last payload was refused; empty where none was.

@@ -5,7 +5,7 @@
 use crate::error::{Error, Result};
 use crate::json::Value;
 use crate::kernel::{blocks, Quadratic, Samples, LANES};
-use crate::wire::Array;
+use crate::wire::{Array, Delta};
 use std::collections::HashMap;
 
 /// What a model gives for one point.
@@ -175,6 +175,14 @@ pub struct Lssvm {
     pub domain: [(f64, f64); 3],
 }
 
+/// Bounds within which a point counts as inside, from the learnt range of y, v and a.
+fn with_margins(learnt: &[f64]) -> [(f64, f64); 3] {
+    std::array::from_fn(|i| {
+        let (low, high) = (learnt[2 * i], learnt[2 * i + 1]);
+        (low - 0.05 * (high - low), high + 0.05 * (high - low))
+    })
+}
+
 impl Lssvm {
     fn new(entries: &Entries, dt_s: f64) -> Result<Lssvm> {
         let of = |name: &str| format!("features.{name}");
@@ -212,8 +220,6 @@ impl Lssvm {
             return Err(Error::new("anchor", format!("{} values", anchor.len()), format!("{p}, or none")));
         }
         let allowed_v = if anchor.is_empty() { 0.0 } else { entries.finite("allowed_V")? };
-        let learnt = entries.vector_of("domain", 6)?;
-        let margin = |i: usize| 0.05 * (learnt[2 * i + 1] - learnt[2 * i]);
         let half_um = 0.5 * (y_max - y_min);
         Ok(Lssvm {
             gain: entries.positive(&of("gain"))?,
@@ -238,7 +244,25 @@ impl Lssvm {
             noise_variance: entries.finite("noise_variance")?,
             kernel_variance: entries.finite("kernel_variance")?,
             shrink: 1.0 / (1.0 + 1.0 / entries.positive("gamma")?),
-            domain: std::array::from_fn(|i| (learnt[2 * i] - margin(i), learnt[2 * i + 1] + margin(i))),
+            domain: with_margins(&entries.vector_of("domain", 6)?),
+        })
+    }
+
+    fn moved(&self, delta: &Delta) -> Result<Lssvm> {
+        if delta.beta.len() != self.beta.len() {
+            return Err(Error::new("n", delta.beta.len(), format!("{}, as the whole model has", self.beta.len())));
+        }
+        if delta.gain <= 0.0 || delta.noise_variance < 0.0 {
+            let got = format!("{}, {}", delta.gain, delta.noise_variance);
+            return Err(Error::new("gain, noise_variance", got, "above 0, and at least 0"));
+        }
+        Ok(Lssvm {
+            gain: delta.gain,
+            offset_um: delta.offset_um,
+            noise_variance: delta.noise_variance,
+            beta: delta.beta.clone(),
+            domain: with_margins(&delta.domain),
+            ..self.clone()
         })
     }
 
@@ -656,6 +680,12 @@ impl Champion {
         &self.models[self.champion]
     }
 
+    fn moved(&self, delta: &Delta) -> Result<Champion> {
+        let mut after = self.clone();
+        after.models[self.champion] = self.served().moved(delta)?;
+        Ok(after)
+    }
+
     /// Weights at point i, from 1 on, from `shares` at the start.
     fn weights(&self, shares: &[f64], i: f64, weights: &mut [f64]) {
         let s = shares[self.champion];
@@ -803,6 +833,15 @@ impl Kind {
         })
     }
 
+    /// After a change of the LSSVM, which is the champion.
+    fn moved(&self, delta: &Delta) -> Result<Kind> {
+        match self {
+            Kind::Lssvm(model) => Ok(Kind::Lssvm(Box::new(model.moved(delta)?))),
+            Kind::Champion(model) => Ok(Kind::Champion(Box::new(model.moved(delta)?))),
+            _ => Err(Error::new("base", "a model without a part that moves", "one that learns")),
+        }
+    }
+
     fn memory_size(&self) -> usize {
         match self {
             Kind::Linear(_) => 0,
@@ -885,6 +924,11 @@ impl Model {
             return Err(Error::new("dt_s", dt_s, "a positive number"));
         }
         Ok(Model { name: name.into(), dt_s, kind: Kind::new(kind, entries, dt_s)? })
+    }
+
+    /// After a change of what moves in it.
+    pub fn moved(&self, delta: &Delta) -> Result<Model> {
+        Ok(Model { kind: self.kind.moved(delta)?, name: self.name.clone(), dt_s: self.dt_s })
     }
 
     /// Doubles of memory.

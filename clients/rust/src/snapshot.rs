@@ -3,16 +3,18 @@
 use crate::error::{Error, Result};
 use crate::json::Value;
 use crate::model::{Entries, Model};
-use crate::wire::{Array, Container};
+use crate::wire::{Array, Container, Delta};
 use std::collections::HashMap;
 
 /// The baseline that answers in place of a model, and its memory in the snapshot.
+#[derive(Clone)]
 pub struct StandIn {
     pub model: Model,
     pub memory: Vec<f64>,
 }
 
 /// A decoded payload of kind 6, and the scratch that its evaluation needs, so that evaluation allocates nothing.
+#[derive(Clone)]
 pub struct Snapshot {
     pub model: Model,
     pub snapshot_seq: i64,
@@ -91,6 +93,15 @@ impl Snapshot {
             stand_in,
             model,
         })
+    }
+
+    /// After a change of this whole model.
+    pub fn moved(&self, delta: &Delta) -> Result<Snapshot> {
+        if delta.memory.len() != self.memory.len() {
+            return Err(Error::new("m", delta.memory.len(), format!("{}, as the whole model has", self.memory.len())));
+        }
+        let (model, memory) = (self.model.moved(delta)?, delta.memory.clone());
+        Ok(Snapshot { model, memory, snapshot_seq: delta.snapshot_seq, ..self.clone() })
     }
 
     /// (weight of the model inside its domain, whether it is stale) where the newest sample is `age_s` old.

@@ -274,8 +274,6 @@ impl Reply {
 pub struct Array {
     pub shape: Vec<usize>,
     pub values: Vec<f64>,
-    /// Whether the payload holds doubles.
-    pub f8: bool,
 }
 
 /// A payload of kind 6 before a model is made of it.
@@ -340,75 +338,44 @@ fn array(data: &[u8], at: usize, row: &Value) -> Result<(String, Array, usize)> 
         "<i4" => f64::from(i32::from_le_bytes(bytes(data, at + 4 * i))),
         _ => f64::from(data[at + i]),
     };
-    Ok((name.to_string(), Array { shape: sizes, values: (0..count).map(value).collect(), f8: dtype == "<f8" }, length))
+    Ok((name.to_string(), Array { shape: sizes, values: (0..count).map(value).collect() }, length))
 }
 
-/// `values` from double `first` of an entry, which has `size` doubles from now on.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Change {
-    pub entry: u32,
-    pub size: u32,
-    pub first: u32,
-    pub values: Vec<f64>,
-}
-
-/// A payload of kind 7: changes, or a whole model (a payload of kind 6).
+/// A payload of kind 7: what has moved in a whole model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Delta {
     pub snapshot_seq: i64,
-    pub before: u32,
-    pub after: u32,
-    pub changes: Vec<Change>,
-    pub model: Option<Vec<u8>>,
+    /// CRC-32 of the payload of the whole model.
+    pub base: u32,
+    pub gain: f64,
+    pub offset_um: f64,
+    pub noise_variance: f64,
+    pub domain: Vec<f64>,
+    pub beta: Vec<f64>,
+    pub memory: Vec<f64>,
 }
-
-/// Most doubles of an entry.
-const MAX_DOUBLES: u32 = 1 << 23;
 
 impl Delta {
     pub fn decode(data: &[u8]) -> Result<Delta> {
-        let (options, n) = header(data, DELTA, 24, 1)?;
-        let (snapshot_seq, before, after) = (i64_at(data, 8), u32_at(data, 16), u32_at(data, 20));
+        let (_, p) = header(data, DELTA, 24, 0)?;
+        let (snapshot_seq, base, m) = (i64_at(data, 8), u32_at(data, 16), u32_at(data, 20));
         if snapshot_seq < -1 {
             return Err(Error::new("snapshot_seq", snapshot_seq, "a sequence number, or -1 before any sample"));
         }
-        let mut delta = Delta { snapshot_seq, before, after, changes: Vec::new(), model: None };
-        if options & 1 != 0 {
-            if n != 1 {
-                return Err(Error::new("n", n, "1 with a whole model"));
-            }
-            if before != 0 {
-                return Err(Error::new("before", before, "0 with a whole model"));
-            }
-            delta.model = Some(data[24..].to_vec());
-            return Ok(delta);
-        }
-        let mut at = 24;
-        for i in 0..n {
-            if at + 16 > data.len() {
-                return Err(Error::new(
-                    "payload",
-                    format!("{} bytes", data.len()),
-                    format!("change {i} of {n} at {at}"),
-                ));
-            }
-            let [entry, size, first, k] = std::array::from_fn(|word| u32_at(data, at + 4 * word));
-            at += 16;
-            if size > MAX_DOUBLES {
-                return Err(Error::new(format!("change[{i}].size"), size, format!("at most {MAX_DOUBLES} doubles")));
-            }
-            if u64::from(first) + u64::from(k) > u64::from(size) {
-                let expected = format!("an end within the {size} doubles of the entry");
-                return Err(Error::new(format!("change[{i}].k"), format!("{first} + {k}"), expected));
-            }
-            let k = k as usize;
-            if at + 8 * k > data.len() {
-                return Err(Error::new("payload", format!("{} bytes", data.len()), format!("{k} doubles at {at}")));
-            }
-            delta.changes.push(Change { entry, size, first, values: doubles(data, at, k) });
-            at += 8 * k;
-        }
-        check_length(data, at)?;
-        Ok(delta)
+        check_sizes(m, 0)?;
+        let moving = 9 + p as usize;
+        check_length(data, 24 + 8 * (moving + m as usize))?;
+        let values = doubles(data, 24, moving);
+        check_finite("values", &values)?;
+        Ok(Delta {
+            snapshot_seq,
+            base,
+            gain: values[0],
+            offset_um: values[1],
+            noise_variance: values[2],
+            domain: values[3..9].to_vec(),
+            beta: values[9..].to_vec(),
+            memory: doubles(data, 24 + 8 * moving, m as usize),
+        })
     }
 }

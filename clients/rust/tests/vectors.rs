@@ -140,7 +140,7 @@ fn start_and_advance_are_what_is_under_way() {
 }
 
 #[test]
-fn changes_add_up_and_what_is_missing_is_noticed() {
+fn changes_are_of_a_whole_model_and_a_missing_one_is_noticed() {
     let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
     let query = read("deltas.query.payload");
     let steps = rows("deltas.txt");
@@ -151,14 +151,11 @@ fn changes_add_up_and_what_is_missing_is_noticed() {
         let got = publisher.update(&read(&row[2]));
         let outcome = match &got {
             Ok(Update::Taken) => "taken",
-            Ok(Update::Known) => "known",
-            Ok(Update::Waits) => "waits",
             Ok(Update::Lost) => "lost",
-            Ok(Update::Mismatch) => "mismatch",
             Err(_) => "refused",
         };
         assert_eq!(outcome, row[3], "{}: {got:?}", row[0]);
-        assert_eq!(format!("{:08x}", publisher.fingerprint()), row[4], "{}", row[0]);
+        assert_eq!(format!("{:08x}", publisher.base()), row[4], "{}", row[0]);
         let reply = folder().join(format!("deltas-{}.reply.payload", row[0]));
         if let Ok(expected) = fs::read(reply) {
             let expected = Reply::decode(&expected).unwrap();
@@ -171,33 +168,24 @@ fn changes_add_up_and_what_is_missing_is_noticed() {
             answered += 1;
         }
     }
-    assert!(answered >= 8);
+    assert!(answered >= 7);
 }
 
 #[test]
-fn no_damage_of_a_change_panics_or_is_taken() {
+fn no_damage_of_a_change_panics_and_none_of_its_head_is_taken() {
     let base = read("deltas-base.fetched.payload");
     let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
-    for name in ["deltas-frame.change.payload", "deltas-kernel.change.payload"] {
-        let whole = read(name);
-        let publisher = Follower::new(&base, limits).unwrap().publisher();
-        if name.contains("kernel") {
-            assert_eq!(publisher.update(&read("deltas-frame.change.payload")).unwrap(), Update::Taken);
-        }
-        let before = publisher.fingerprint();
-        for end in (0..whole.len()).step_by(7) {
-            assert!(publisher.update(&whole[..end]).is_err(), "{name} cut to {end}");
-        }
-        for at in (0..whole.len()).step_by(3).filter(|at| !(8..16).contains(at)) {
-            let mut changed = whole.clone();
-            changed[at] ^= 1 << (at % 8);
-            let publisher = Follower::new(&base, limits).unwrap().publisher();
-            if name.contains("kernel") {
-                publisher.update(&read("deltas-frame.change.payload")).unwrap();
-            }
-            assert!(!matches!(publisher.update(&changed), Ok(Update::Taken)), "{name} byte {at}");
-            assert_eq!(publisher.fingerprint(), before);
-        }
+    let whole = read("deltas-frame.change.payload");
+    let publisher = Follower::new(&base, limits).unwrap().publisher();
+    for end in (0..whole.len()).step_by(7) {
+        assert!(publisher.update(&whole[..end]).is_err(), "cut to {end}");
+    }
+    for at in 0..whole.len() {
+        let mut changed = whole.clone();
+        changed[at] ^= 1 << (at % 8);
+        // A number of the model may be another one: what is sent is signed, not summed.
+        let update = publisher.update(&changed);
+        assert!(at >= 24 || (8..16).contains(&at) || !matches!(update, Ok(Update::Taken)), "byte {at}");
     }
 }
 

@@ -20,8 +20,7 @@ import zenoh
 
 import tests.conftest  # noqa: F401  the key that service and clients share
 from dehyst.service.client.client import Client
-from dehyst.service.protocol.delta import FollowedState, encode_delta
-from dehyst.service.protocol.model import model_parts
+from dehyst.service.protocol.model import encode_model
 from dehyst.service.protocol.query import Answer as Reply
 from dehyst.service.protocol.query import decode_reply, encode_query, encode_reply
 from tests.service.conftest import ServeProcess, make_models, unused_port, write_config
@@ -138,9 +137,9 @@ def test_a_liar_beside_the_service_is_not_believed(native: ctypes.CDLL, endpoint
         assert native.dehyst_point(handle, 40.0, 0.0, 0.0, ctypes.byref(answer)) == 0
         honest_V = answer.u_V
         model = make_models(1000.0)["lssvm_adaptive"]
-        state = FollowedState.of(*model_parts("lssvm_adaptive", model, np.zeros(model.memory_size)), 10**9, None)
+        forged = encode_model("lssvm_adaptive", model, 10**9, np.zeros(model.memory_size))
         for _ in range(50):
-            session.put(keys.model_delta, encode_delta(state.whole()), attachment=bytes(32))
+            session.put(keys.model_delta, forged, attachment=bytes(32))
             time.sleep(1e-3)
         assert native.dehyst_point(handle, 40.0, 0.0, 0.0, ctypes.byref(answer)) == 0
         assert answer.u_V == pytest.approx(honest_V, abs=0.01)

@@ -15,7 +15,6 @@ from dehyst.service.client.client import Client
 from dehyst.service.client.correcting import Correcting
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
-from dehyst.service.protocol.delta import FollowedState
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.model import ModelMessage, Safety, decode_model, encode_model
 from tests.service.conftest import make_models
@@ -214,11 +213,6 @@ def test_a_trouble_travels_with_the_model_and_is_nothing_while_all_is_well() -> 
     assert b"trouble" not in message(Safety())
     told = decode_model(message(Safety(trouble="sensor_stuck")))
     assert (told.safety.trouble, decode_model(message(Safety())).safety.trouble) == ("sensor_stuck", "")
-    before = FollowedState.decode(message(Safety()))
-    after, change = before.replaced(FollowedState.decode(message(Safety(trouble="sensor_stuck"))))
-    assert change is not None
-    assert change.model  # another form: the whole model
-    assert after.message().safety.trouble == "sensor_stuck"
 
 
 def test_an_older_or_newer_service_is_understood() -> None:

@@ -69,7 +69,7 @@ def test_a_claim_with_a_wrong_tag_or_an_absurd_epoch_is_none() -> None:
     assert claims.highest() == Claim(3, "i-peer")
     claims.ignore(Claim(3, "i-peer"))
     assert claims.highest() is None
-    assert Claim.read(NO_KEY, KEYS, KEYS.claim(10**9, "i-a")) == Claim(10**9, "i-a")
+    assert Claim.read(NO_KEY, KEYS, KEYS.token("claim", "1000000000/i-a")) == Claim(10**9, "i-a")
     for epoch in ("²", "١", "-1", str(10**9 + 1), "9" * 400, "1.5", ""):
         assert Claim.read(NO_KEY, KEYS, f"{KEYS.base}/claim/{epoch}/i-a") is None
 

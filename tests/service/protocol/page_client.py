@@ -165,127 +165,47 @@ def decode_fleet(data: bytes) -> tuple[int, dict[str, list[float]]]:
 # --- Changes of a model.
 
 
-class Refused(Exception):
-    """A change that does not fit the model."""
-
-
 class Changes:
-    """A model and its changes: `fetched` and `change` take messages and say what became of them."""
+    """A whole model and its newest change: `take` takes messages and says what became of them."""
 
     def __init__(self) -> None:
-        self.fingerprint = 0
-        self._model: dict[str, Any] = {}
-        self._entries: dict[str, list[float]] = {}
-        self._seq = -1
-        self._waiting: list[bytes] | None = []
+        self.base = 0
+        self._whole: dict[str, Any] = {}
+        self._change: tuple[int, list[float], list[float]] | None = None
 
-    def fetched(self, data: bytes) -> str:
-        """The answer to a query for the whole model; then what waited."""
-        self._begin(decode_model(data))
-        waiting, self._waiting = self._waiting or [], None
-        for message in waiting:
-            if struct.unpack_from("<I", message, 16)[0] == self.fingerprint:
-                assert self.change(message) == "taken"
-        return "taken"
-
-    def change(self, data: bytes) -> str:
-        """A payload of kind 7."""
-        version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
-        assert (version, kind) == (1, 7)
-        seq, before, after = struct.unpack_from("<qII", data, 8)
-        if options & 1:
-            self._begin(decode_model(data[24:]))
-            self._waiting = None
-            assert (n, before, after) == (1, 0, self.fingerprint)
+    def take(self, data: bytes) -> str:
+        """A payload of kind 6 or 7."""
+        if data[1] == 6:
+            self._whole, self.base, self._change = decode_model(data), zlib.crc32(data), None
             return "taken"
-        if self._waiting is not None:
-            self._waiting.append(data)
-            return "waits"
-        if after == self.fingerprint:
-            return "known"
-        if before != self.fingerprint:
-            self._waiting = [data]
+        version, kind, options, p, seq, base, m = struct.unpack_from("<BBHIqII", data)
+        assert (version, kind, options, len(data)) == (1, 7, 0, 24 + 8 * (9 + p + m))
+        if base != self.base:
             return "lost"
-        kept, at = dict(self._entries), 24
-        try:
-            names = self._names()
-            for _ in range(n):
-                entry, size, first, k = struct.unpack_from("<IIII", data, at)
-                values = struct.unpack_from(f"<{k}d", data, at + 16)
-                at += 16 + 8 * k
-                if entry >= len(names):
-                    raise Refused
-                self._entries[names[entry]] = self._changed(names[entry], size, first, values)
-            assert at == len(data)
-            if self._sum() != after:
-                raise ArithmeticError
-            self._check()
-        except (Refused, ArithmeticError) as error:
-            self._entries, self._waiting = kept, []
-            return "refused" if isinstance(error, Refused) else "mismatch"
-        self._seq, self.fingerprint = seq, after
+        values = list(struct.unpack_from(f"<{9 + p + m}d", data, 24))
+        moving, memory = values[: 9 + p], values[9 + p :]
+        known, prefix = self._whole["data"], self._prefix()
+        if f"{prefix}alpha" not in known or (p, m) != (len(known[f"{prefix}beta"]), len(known["/memory"])):
+            return "refused"
+        if not all(map(math.isfinite, moving)) or moving[2] < 0.0:
+            return "refused"
+        self._change = seq, moving, memory
         return "taken"
 
     def model(self) -> dict[str, Any]:
         """The model as `decode_model` gives it."""
-        old, entries = self._model, self._entries
-        text = json.loads(json.dumps({key: old[key] for key in old if key not in ("data", "arrays")}))
-        for name, (into, key) in self._places(text).items():
-            into[key] = type(into[key])(entries[name][0])
-        data = {name: entries[name] if shape else entries[name][0] for name, _, shape in old["arrays"]}
-        data |= {name: [int(x) for x in data[name]] for name in data if name.endswith("kernel_plays")}
-        return {**text, "data": data, "snapshot_seq": self._seq}
+        if self._change is None:
+            return self._whole
+        (seq, moving, memory), prefix = self._change, self._prefix()
+        names = ("features.gain", "features.offset_um", "noise_variance")
+        values = self._whole["values"] | {prefix + name: value for name, value in zip(names, moving[:3], strict=True)}
+        data = self._whole["data"] | {f"{prefix}domain": moving[3:9], f"{prefix}beta": moving[9:], "/memory": memory}
+        return {**self._whole, "values": values, "data": data, "snapshot_seq": seq}
 
-    def _begin(self, model: dict[str, Any]) -> None:
-        self._model, self._seq = model, model["snapshot_seq"]
-        self._entries = {name: [float(into[key])] for name, (into, key) in self._places(model).items()}
-        for name, values in model["data"].items():
-            self._entries[name] = [float(x) for x in (values if isinstance(values, list) else [values])]
-        self.fingerprint = self._sum()
-
-    @staticmethod
-    def _places(text: dict[str, Any]) -> dict[str, tuple[dict[str, Any], str]]:
-        """Where the numbers in the JSON stand, by entry."""
-        safety = text.get("safety", {})
-        groups = (("", text["values"]), ("/safety/", safety))
-        groups = (*groups, ("/stand_in/", safety.get("stand_in", {}).get("values", {})))
-        return {
-            prefix + key: (group, key)
-            for prefix, group in groups
-            for key, value in group.items()
-            if isinstance(value, bool | int | float) and key != "seq" and not key.endswith(".seq")
-        }
-
-    def _names(self) -> list[str]:
-        return sorted(self._entries, key=lambda name: name.encode())
-
-    def _sum(self) -> int:
-        names = self._names()
-        words = [zlib.crc32("\n".join(names).encode())]
-        words += [zlib.crc32(struct.pack(f"<{len(self._entries[n])}d", *self._entries[n])) for n in names]
-        return zlib.crc32(struct.pack(f"<{len(words)}I", *words))
-
-    def _changed(self, name: str, size: int, first: int, values: tuple[float, ...]) -> list[float]:
-        now = list(self._entries[name])
-        if size != len(now):
-            rows = {array: (dtype, shape) for array, dtype, shape in self._model["arrays"]}
-            dtype, shape = rows.get(name, ("", []))
-            if dtype != "<f8" or not shape or size % math.prod(shape[1:]):
-                raise Refused
-            if size > len(now) and not (first <= len(now) and first + len(values) == size):
-                raise Refused
-            now = now[:size]
-        now[first : first + len(values)] = values
-        return now
-
-    def _check(self) -> None:
-        """What a model needs to be one."""
-        for name, (into, key) in self._places(self._model).items():
-            if isinstance(into[key], int) and self._entries[name][0] != int(self._entries[name][0]):
-                raise Refused
-        for name in self._entries:
-            if name.endswith("beta") and not all(map(math.isfinite, self._entries[name])):
-                raise Refused
+    def _prefix(self) -> str:
+        """Begin of the names of what moves: in a champion, its own name."""
+        values = self._whole["values"]
+        return f"{values['names'].split(',')[values['champion']]}." if self._whole["kind"] == "champion" else ""
 
 
 # --- Models. Each gives (voltages, deviations, inside, memory after the last point) for n points.

@@ -170,6 +170,9 @@ def test_only_the_roles_meant_to_have_a_right_have_it() -> None:
                 for key in rule["key_exprs"]:
                     may.setdefault((message, key), set()).add(name)
     every = {"service", "router"}  # through their rule for all keys; the service's denials are tried for real below
+    of_stage = {f"dehyst/v1/{stage}/*/{what}" for stage in ("*", "elsewhere") for what in ("sample", "stage_status")}
+    of_controller = {"dehyst/v1/*/*/command", "dehyst/v1/*/*/reference"}
+    assert {key for message, key in may if message == "put"} == {"dehyst/v1/**"} | of_stage | of_controller
     assert may["put", "dehyst/v1/*/*/sample"] == {"afm"}
     assert may["put", "dehyst/v1/elsewhere/*/sample"] == {"other"}
     assert may["put", "dehyst/v1/*/*/command"] == {"loop"}

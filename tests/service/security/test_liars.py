@@ -22,10 +22,9 @@ import zenoh
 from dehyst.service.client.client import Client
 from dehyst.service.config.settings import read_config
 from dehyst.service.operating.remote import operate
-from dehyst.service.protocol.delta import FollowedState, encode_delta
 from dehyst.service.protocol.errors import NoReplyError
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.protocol.model import encode_model, model_parts
+from dehyst.service.protocol.model import encode_model
 from dehyst.service.protocol.query import Answer, encode_query, encode_reply
 from dehyst.service.protocol.samples import encode_samples
 from dehyst.service.runtime.session import SURELY, open_client
@@ -104,9 +103,7 @@ def test_a_follower_takes_no_model_of_a_liar(endpoint: str, liar: zenoh.Session,
         steep = replace(model, beta=2.0 * model.beta)  # type: ignore[type-var, attr-defined]
         slow = make_models(1000.0)[LEARNING]  # a sample time for which the slew limit allows any step
         for forged in (steep, slow):
-            state = FollowedState.of(*model_parts(LEARNING, forged, np.zeros(forged.memory_size)), 10**6, None)
-            memory = state.message().memory
-            whole = encode_delta(state.whole()) if deltas else encode_model(LEARNING, forged, 10**6, memory)
+            whole = encode_model(LEARNING, forged, 10**6, np.zeros(forged.memory_size))
             for _ in range(100):
                 liar.put(
                     KEYS.model_delta if deltas else KEYS.model, whole, attachment=bytes(32), congestion_control=SURELY

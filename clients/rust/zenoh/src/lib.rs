@@ -17,7 +17,7 @@ use dehyst::authenticator::{Heard, Question, Sender, STAMP};
 use dehyst::json::{self, Value};
 use dehyst::{Authenticator, Error, Follower, Limits, Publisher, Result, Update};
 use std::hash::{BuildHasher, RandomState};
-use std::sync::mpsc::{SyncSender, TryRecvError};
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 use zenoh::bytes::ZBytes;
@@ -110,10 +110,10 @@ pub fn open(options: &Options) -> Result<Live> {
     // A service that publishes no changes publishes whole models.
     let changes = status.get("delta_hz").and_then(Value::number).is_some_and(|rate| rate > 0.0);
     let whole = format!("{}/model?name={name}{}", feed.base, if changes { ";changes=1" } else { "" });
-    let repair = repairer(feed.asker.clone(), whole.clone(), publisher.clone(), sender.clone());
+    let fetch = fetcher(feed.asker.clone(), whole.clone(), publisher.clone(), sender.clone());
     let key = key.map(|key| format!("{}/{key}{}", feed.base, if changes { "_delta" } else { "" }));
     if let Some(key) = key.clone() {
-        let (publisher, repair, sender) = (publisher.clone(), repair.clone(), sender.clone());
+        let (publisher, fetch, sender) = (publisher.clone(), fetch.clone(), sender.clone());
         let by = feed.asker.by.clone();
         let subscriber = feed
             .asker
@@ -124,16 +124,14 @@ pub fn open(options: &Options) -> Result<Live> {
                 let Some(publisher) = publisher.get() else {
                     return drop(early.try_send((payload.into_owned(), attached)));
                 };
-                let complete = match locked(&sender).hear(&by, &key, &attached, &payload) {
-                    // What is refused is counted there. A whole model is complete again; changes are not.
-                    Heard::Taken => {
-                        matches!(publisher.update(&payload), Ok(Update::Taken | Update::Known | Update::Waits))
-                    }
+                let known = match locked(&sender).hear(&by, &key, &attached, &payload) {
+                    // What is refused is counted there.
+                    Heard::Taken => !matches!(publisher.update(&payload), Ok(Update::Lost)),
                     Heard::Refused => true,
                     Heard::Unknown => false, // another instance serves
                 };
-                if !complete {
-                    let _ = repair.try_send(()); // one that waits already is enough
+                if !known {
+                    let _ = fetch.try_send(()); // one that waits already is enough
                 }
             })
             .wait()
@@ -144,22 +142,21 @@ pub fn open(options: &Options) -> Result<Live> {
     let follower = Follower::new(&model, limits)?;
     locked(&sender).meet(&attached);
     let own = follower.publisher();
-    let mut missing = false;
     while let Ok((payload, attached)) = waiting.try_recv() {
         let key = key.as_deref().unwrap_or_default();
         if locked(&sender).hear(&feed.asker.by, key, &attached, &payload) == Heard::Taken {
-            missing = !matches!(own.update(&payload), Ok(Update::Taken | Update::Known));
+            let _ = own.update(&payload); // what is missing shows with the next change
         }
     }
     drop(publisher.set(own));
-    if missing {
-        let _ = repair.try_send(()); // one that waits already is enough
-    }
     Ok(Live { follower, feed })
 }
 
-/// A thread that fetches the whole model when it is told that a change is missing. It ends with the sender.
-fn repairer(
+/// Pause between two fetches of the whole model.
+const FETCH_PAUSE: Duration = Duration::from_secs(1);
+
+/// A thread that fetches the whole model when it is told that one is missing. It ends with the sender.
+fn fetcher(
     asker: Asker,
     selector: String,
     publisher: Arc<OnceLock<Publisher>>,
@@ -168,25 +165,16 @@ fn repairer(
     let (sender, missing) = std::sync::mpsc::sync_channel::<()>(1);
     let work = move || {
         while missing.recv().is_ok() {
-            let mut pause = Duration::from_millis(5);
-            while let Some(publisher) = publisher.get() {
-                let got = asker.get(&selector, &[], Duration::from_secs(2)).and_then(|(payload, attached)| {
-                    locked(&whose).meet(&attached);
-                    publisher.update(&payload)
-                });
-                // Until the changes that came meanwhile follow the model that was fetched.
-                if matches!(got, Ok(Update::Taken)) {
-                    break;
-                }
-                std::thread::sleep(pause);
-                pause = (2 * pause).min(Duration::from_secs(1));
-                if matches!(missing.try_recv(), Err(TryRecvError::Disconnected)) {
-                    return;
-                }
+            if let (Some(publisher), Ok((payload, attached))) =
+                (publisher.get(), asker.get(&selector, &[], Duration::from_secs(2)))
+            {
+                locked(&whose).meet(&attached);
+                let _ = publisher.update(&payload); // an error is counted there
             }
+            std::thread::sleep(FETCH_PAUSE);
         }
     };
-    drop(std::thread::Builder::new().name("dehyst-repair".into()).spawn(work));
+    drop(std::thread::Builder::new().name("dehyst-fetch".into()).spawn(work));
     sender
 }
 
