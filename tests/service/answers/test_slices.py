@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import vectors
 from dehyst.service.answers.fallback import Rules, answer_safely
 from dehyst.service.answers.guard import Limits
 from dehyst.service.answers.slices import SLICE
 from dehyst.service.protocol.model import decode_model
 from dehyst.service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STAND_IN
+from tests.vectors import make_vectors as vectors
 
 N = 3 * SLICE + 77
 K = np.arange(N)
