@@ -72,9 +72,9 @@ from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
 from benchmarks.measured import RECORDS, Cut, data_folder, replayed
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner
+from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.drift import DriftConfig, DriftFilter, RestCreep
+from dehyst.adaptive.online.drift import DriftConfig, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow
@@ -314,6 +314,10 @@ def scaled(value: float, factor: float) -> float:
     return moved if moved != value or not value else value + (1 if factor > 1.0 else -1)
 
 
+#: Numbers that stand for nothing, or for a place in an array.
+NO_CONSTANTS: Final = frozenset({"NOWHERE"})
+
+
 def constants_of(text: str, module: str) -> list[Constant]:
     """The numbers, and tuples of numbers, that a module assigns in its source."""
     found = []
@@ -329,7 +333,7 @@ def constants_of(text: str, module: str) -> list[Constant]:
             if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
                 names, values = target.elts, value.elts
             for name, one in zip(names, values, strict=True):
-                if isinstance(name, ast.Name):
+                if isinstance(name, ast.Name) and name.id not in NO_CONSTANTS:
                     found.extend(_constants(module, name.id, _number(one)))
     return found
 
@@ -577,6 +581,11 @@ def _begin_anew(self: Intake, sample: Sample, _hold: Any) -> Any:
     return self._restart(sample, gates.SETTLING)
 
 
+def _never_alone(self: Parts) -> bool:
+    self.alone = False
+    return False
+
+
 def _no_kernel(self: ResidualWindow) -> tuple[FloatArray, FloatArray, float]:
     support, alpha, _ = _ARRAYS(self)
     return support, np.zeros_like(alpha), 0.0
@@ -615,8 +624,10 @@ def _always_judges(self: Intake) -> bool:
 RULES: Final = (
     Rule("surprising readings are held", ((gates, "surprise", _always(math.inf)),)),
     Rule("motion not yet learnt is not judged", ((intake, "is_known", _always(True)),)),
-    Rule("only a model with credit judges", ((Intake, "_judges", _always_judges),)),
-    Rule("a model judges at all", ((Intake, "_judges", _always(False)),)),
+    Rule("only a model with credit judges", ((Intake, "_judges", _always_judges), (Intake, "_check_model", _nothing))),
+    Rule("a model judges at all", ((Intake, "_judges", _always(False)), (Intake, "_check_model", _nothing))),
+    Rule("readings that lag are held", ((Intake, "_lags", _always(False)),)),
+    Rule("repeated readings are none", ((gates, "check_repeats", _always("")),)),
     Rule("readings must follow the drive", ((Intake, "follow", _always(False)),)),
     Rule("undecided readings go on trial", ((Intake, "_give_up", _begin_anew),)),
     Rule("jumps move the frame", ((glitch_or_jump, "_is_jump", _always(False)),)),
@@ -629,16 +640,18 @@ RULES: Final = (
     Rule("validity", ((Judgement, "decide", _always(True)),)),
     Rule("doubt after a jump", ((Judgement, "add_doubt", _nothing),)),
     Rule("a sudden change is detected", ((drift, "DEAD_S", math.inf),)),
-    Rule("a jump or a return opens the filter", ((DriftFilter, "expect_change", _nothing),)),
+    Rule("a jump opens the filter", ((Parts, "expect_change", _nothing),)),
     Rule("outliers are refused by the filter", ((drift, "update", _ungated),)),
+    Rule("samples from before a change count less", ((ResidualWindow, "let_go", _nothing),)),
     Rule("the window learns", ((ResidualWindow, "learn", _always(LEARNT)),)),
     Rule("the kernel part", ((ResidualWindow, "predict", _always(0.0)), (ResidualWindow, "arrays", _no_kernel))),
     Rule("only the share that is borne out of the kernel part", ((ResidualWindow, "weigh", _nothing),)),
     Rule("the noise follows from the innovations", ((drift, "update", _of_fixed_noise),)),
     Rule("the window learns at moving phases", ((learner, "due", _fixed_phase),)),
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
-    Rule("identified model during a trial", ((Parts, "watch_trial", _nothing),)),
+    Rule("identified model during a trial", ((Parts, "watch_trial", _never_alone),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
+    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
 )  # fmt: skip
 
 

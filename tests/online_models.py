@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.online.track import Pair
+from dehyst.adaptive.online.learner import Learner, Parts
 from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -100,8 +99,5 @@ class SmoothingLearner(PlainLearner):
     inner: Learner
 
     @property
-    def lag(self) -> int:
-        return self.inner.lag
-
-    def smoothed(self) -> tuple[Pair, bool] | None:
-        return self.inner.smoothed()
+    def parts(self) -> Parts:
+        return self.inner.parts

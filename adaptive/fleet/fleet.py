@@ -45,11 +45,13 @@ class FleetConfig:
     device : ``cpu`` steps the windows by the single learner's own compiled code, on the processor; any device of torch,
     its processor ``cpu:0`` too, by operations of torch, in the inverse form.
     threads : that share the axes of a step; the result does not depend on them.
+    checks : most axes at a time whose model is under a control trial (`docs/learner.md`); others wait for their turn.
     """
 
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     device: str = "cpu"
     threads: int = 2
+    checks: int = 16
 
     def __post_init__(self) -> None:
         form = self.learner.solver.form
@@ -57,6 +59,8 @@ class FleetConfig:
             raise InputError("device: got nothing, expected 'cpu' or a device of torch, as 'cuda'")
         if not 1 <= self.threads <= 256:
             raise InputError(f"threads: got {self.threads}, expected 1 to 256")
+        if self.checks < 1:
+            raise InputError(f"checks: got {self.checks}, expected at least 1 axis")
         if self.device != "cpu" and form != "inverse":
             raise InputError(f"learner.solver.form: got {form!r}, expected 'inverse', which device {self.device!r} has")
 
@@ -134,19 +138,31 @@ class Fleet:
         s, c, w, share, none = self._state.rows, self._c, self._samples, self._threads.share, np.arange(0)
         share(0, steps.take, none, s, c, w)
         share(0, steps.teach, none, self._windows.predict(none), s, c, w)
+        self._windows.let_go(none)
         self._windows.learn(none, w)
         still = np.zeros((self.axes, 1))
         self.snapshot().feedforward(still, still, still, self.memory())
 
+    def _let_check(self, inside: IntArray) -> None:
+        """Note whose control trial may begin: as many as the configuration allows, the longest waiting first."""
+        waits = self._state.rows.numbers["front"]["until_control"]
+        due = inside[waits[inside] <= 1]
+        room = self.config.checks - sum(one.parts.intake.controls for one in self.apart.values())
+        self._samples["controls"] = False
+        self._samples["controls"][due[waits[due].argsort(kind="stable")[: max(room, 0)]]] = True
+
     def _step_together(self, inside: IntArray) -> None:
         s, c, w, share = self._state.rows, self._c, self._samples, self._threads.share
         outcome = w["outcome"]
+        self._let_check(inside)
         share(inside.size, steps.take, inside, s, c, w)
         axes = inside[outcome[inside] == TEACHES]
         failed = axes[:0]
         if axes.size:
             share(axes.size, steps.teach, axes, self._windows.predict(axes), s, c, w)
-            learning = axes[w["learns"][axes]]
+            fading, learning = axes[w["lets_go"][axes] & (outcome[axes] >= 0)], axes[w["learns"][axes]]
+            if fading.size:
+                self._windows.let_go(fading)
             if learning.size:
                 status = self._windows.learn(learning, w)
                 learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)

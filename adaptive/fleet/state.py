@@ -17,7 +17,7 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureArrays
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import answers, drive_V
+from dehyst.adaptive.online.dead_reckoning import answers, drive_V, mean_slope
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
 from dehyst.adaptive.online.learner import MARK_S, REFERENCE_S, Learner
@@ -166,8 +166,9 @@ def check_alike(bases: Sequence[LssvmInverse]) -> None:
 def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Sequence[Learner]) -> Fixed:
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
-    steps = {"dt_s": dt_s, "step_s": step_s, "mark_every": max(1, round(MARK_S / step_s)),
-             "reference_every": max(1, round(REFERENCE_S / step_s)), "window_every": config.window_every,
+    steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
+             "mark_every": max(1, round(MARK_S / step_s)), "reference_every": max(1, round(REFERENCE_S / step_s)),
+             "window_every": config.window_every,
              "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
@@ -177,7 +178,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         reach_V = template.parts.allowed_V - shape * drive_V(template.base)
         axes.append({
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
-            "drive_V": drive_V(base), "tells": answers(base),
+            "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
             "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0,
             "model": number,
         })  # fmt: skip
@@ -200,6 +201,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
 def _ordinary(model: LssvmInverse, config: LearnerConfig) -> StateDict:
     """The state of a learner that has just got all that an ordinary one has."""
     learner, f = Learner(model, config), model.features
+    # Not one more: with the next one a control trial may begin, which is none of what every one has.
     for k in range(learner.parts.intake.smoother.config.lag + 1):
         learner.handle(Sample(k, k * model.dt_s, 0.0, 0.5 * (f.y_min_um + f.y_max_um)))
     # A state that was read has its kinds of numbers, whatever was given.

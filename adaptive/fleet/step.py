@@ -20,7 +20,7 @@ from dehyst.adaptive.online import gates, intake, learner
 from dehyst.adaptive.online.drift import RestCreep, update
 from dehyst.adaptive.online.gates import AdmissionState
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
-from dehyst.adaptive.online.kernel_window import KernelShare
+from dehyst.adaptive.online.kernel_window import NOWHERE, KernelShare
 from dehyst.adaptive.online.kernel_window import due as window_due
 from dehyst.adaptive.online.learner import Judgement
 from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
@@ -38,7 +38,7 @@ ODD: Final = -4
 # learner's dataclasses, and written as items.
 _judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
 _follow, _rest_shift_um, _leave_rest = Following.take, RestCreep.shift_um, RestCreep.leave
-_note_taken, _note_step = AdmissionState.take, AdmissionState.step
+_note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
 _forget_slopes, _weigh = Following.forget_slopes, KernelShare.take
 _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
     OUTCOMES.index(name)
@@ -46,11 +46,12 @@ _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
 )
 
 
-#: A sample of an axis, and what is made of it. outcome : of the sample, or a number from above. learns : whether the
-#: window is to learn target_V.
+#: A sample of an axis, and what is made of it. controls : whether the control trial of the axis may begin now.
+#: outcome : of the sample, or a number from above. lets_go, learns : steps that the window is to make, of target_V.
 SAMPLE: Final = np.dtype([
     ("seq", np.int64), ("t_s", np.float64), ("u_V", np.float64), ("y_um", np.float64), ("present", np.bool_),
-    ("outcome", np.int64), ("learns", np.bool_), ("target_V", np.float64),
+    ("controls", np.bool_), ("outcome", np.int64), ("lets_go", np.bool_), ("learns", np.bool_),
+    ("target_V", np.float64),
 ], align=True)  # fmt: skip
 
 
@@ -87,6 +88,17 @@ def _remember_place(s: Rows, b: int, keep: bool) -> None:
 
 
 @compiled
+def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
+    """`Intake._lags`: whether the reading has not moved with the voltage, by a rough measure."""
+    r, front, f, slots = s.numbers[b], s.numbers[b].front, c.axis[b], s.voltages.shape[1]
+    if not (f.tells and front.credit > 0) or r.past_count == 0 or front.gates.since_start < front.look_from:
+        return False
+    last, first = front.track.smoother.count - 1, front.track.smoother.count + 1 - slots
+    x_um = (s.voltages[b, last % slots] - s.voltages[b, first % slots]) / f.slope_V_per_um
+    return bool(intake.lags(front.gates, x_um, y_um - s.readings[b, (first + 1) % slots], f.range_um))
+
+
+@compiled
 def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
     """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
     front, f, a = s.numbers[b].front, c.axis[b], c.config[0].admission
@@ -103,14 +115,18 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
     if sample.seq != g.seq + 1:
         return DOUBT
     gates.watch_voltage(g, sample.u_V)
-    _note_taken(g, sample)
+    _note_taken(g, sample, 1)
+    refused = gates.check_repeats(g, sample, f.span_V)
     innovation = (sample.y_um - s.x[b, 0]) / f.range_um
     slope, bend = s.drive_x[b, 1] * c.output_scale[1], s.drive_x[b, 2] * c.output_scale[2]
     known = g.since_start > a.settle and intake.is_known(s.known[b, 0], slope, bend)
-    if known and abs(innovation) > gates.surprise(a, g, f.span_V):
+    if refused != "" or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
+        return DOUBT
+    if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
         return DOUBT
     gates.watch_innovation(a, g, innovation)
-    return TEACHES
+    front["until_control"] -= 1
+    return DOUBT if known and f.tells and front.until_control <= 0 and sample.controls else TEACHES
 
 
 @compiled
@@ -119,6 +135,7 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
     r, slots = s.numbers[b], s.voltages.shape[1]
     front, smoother = r.front, r.front.track.smoother
     _note_step(front.gates)
+    front["calm"] += 1
     s.past_voltages[b, r.past_written % s.past_voltages.shape[1]] = u_V
     r["past_written"] += 1
     if r.past_count > 0 and r.past_written - s.past_from[b, 0] > MOST_BRIDGED:
@@ -182,7 +199,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         u, before = r.front.track.smooth_V, s.voltages[b, (now - 1) % s.voltages.shape[1]]
         saturated = gates.check_pair(config.admission, s.voltages[b, at], before, motion[0]) != ""
         kept = s.numbers[b : b + 1].copy()
-        t["learns"] = False
+        t["lets_go"] = t["learns"] = False
         t["outcome"] = _SATURATED if saturated else _number_of(gates.PASSED)
         served, count = r.front.track.served, r.front.track.smoother.count
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
@@ -193,7 +210,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
         _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
         frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
-        if _finds_fault(s, c, b, h, target, u, frozen_V, saturated):
+        if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
             s.numbers[b] = kept[0]
             t["outcome"] = ODD
             continue
@@ -202,7 +219,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         if r.frozen:
             t["outcome"] = _FROZEN
             continue
-        remainder_V = u - dot(h, s.beta[b], p)
+        left_V = u - dot(h, s.beta[b], p)
         said = update(
             config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
             target, not rests, gain, row,
@@ -210,13 +227,16 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         if said == "outlier":
             t["outcome"] = _OUTLIER
             continue
+        if said == "burst":
+            r.window["changed"], r.window["next"] = r.window.clock, 0
+        t["lets_go"] = r.judgement.valid and r.window.next != NOWHERE
         if rests:
             shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
             served["offset_um"] += shift_um
             s.frames[b, 0] = served.offset_um
         else:
             _leave_rest(r.rest)
-            _weigh(r.window, kernel_V[k], remainder_V, config.step_s)
+            _weigh(r.window, kernel_V[k], left_V, config.step_s)
         t["outcome"] = _UNEXCITED if rests else _LEARNT
         if not rests and r.judgement.valid:
             for i in range(2):
@@ -230,7 +250,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
 
 @compiled
 def _finds_fault(
-    s: Rows, c: Fixed, b: int, h: FloatArray, target: float, u: float, frozen_V: float, saturated: bool
+    s: Rows, c: Fixed, b: int, h: FloatArray, target: float, u: float, frozen_V: float, saturated: bool, checks: bool
 ) -> bool:
     """Errors of the models as they were served, all checks, and marks (`Parts.judge`, `Learner._check`).
 
@@ -247,12 +267,12 @@ def _finds_fault(
     r.events["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
     fault = j.fallen_s > learner.ROLLBACK_S
     confirmed = places = False
-    if f.tells and not saturated:
-        follows = r.front.following
+    if checks and f.tells and not saturated:
+        follows, fastest_V_per_s = r.front.following, config.envelope.drift_per_s * f.drive_V
         known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
         judges = known and r.front.credit > 0
         p_V = u - target + dot(h, s.references[b, 0], p)
-        odd = _follow(follows, u, p_V, f.drive_V, config.step_s)
+        odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
         if not known:
             _forget_slopes(follows)
         fault = fault or (odd and judges) or follows.still >= STILL_STEPS
@@ -266,15 +286,12 @@ def _finds_fault(
     if good and j.judged % config.mark_every == 0:
         s.marks[b, 0] = s.marks[b, 1]
         s.marks[b, 1, 0], s.marks[b, 1, 1:] = s.beta[b], s.covariance[b]
-    looks = j.judged % config.reference_every == 0
-    if looks:
-        r.front["credit"] = intake.credit_after(r.front.credit, j.valid)
-    if looks and good:
+    if good and j.judged % config.reference_every == 0:
         s.references[b, 0], s.references[b, 1] = s.references[b, 1], s.beta[b]
         s.known[b, 0], s.known[b, 1] = s.known[b, 1], s.known[b, 2]
     if places:
         if confirmed:
-            r.front.following["good"] = 0
+            _count_again(r.front.following)
         _remember_place(s, b, False)
     return False
 

@@ -57,10 +57,18 @@ def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed
         b = axes[k]
         A, r = arrays_of(handles[b]), s.numbers[b].window
         empty = A.C[COUNT] == 0
-        r["clock"] += 1
-        status = window.learn(A, s.point[b], w[b].target_V, s.born[b], r.clock, fifo)
+        status = window.learn(A, r, s.point[b], w[b].target_V, s.born[b], fifo)
         # An empty window has nothing that a new factorisation could mend.
         out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
+
+
+@compiled
+def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
+    """`ResidualWindow.let_go` of each axis."""
+    most = c.config[0].before_change
+    for k in range(lo, hi):
+        b = axes[k]
+        window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b])
 
 
 class CompiledWindows:
@@ -119,3 +127,8 @@ class CompiledWindows:
         out = np.empty(axes.size, dtype=np.int64)
         self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, w, out)
         return out
+
+    def let_go(self, axes: IntArray) -> None:
+        """`ResidualWindow.let_go` of each axis."""
+        self.write(axes.tolist())
+        self._threads.share(axes.size, let_go, self._handles, axes, self._rows, self._fixed)

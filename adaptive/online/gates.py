@@ -32,6 +32,9 @@ RAIL_SLACK = 0.02
 KINK_DECAY, KINK_SHARE = 0.9, 2.0
 #: Samples over which the smoother's prediction errors are averaged; each counts at most this many times the rms.
 INNOVATION_SAMPLES, FAR_RMS = 500, 2.0
+#: Equal readings are none where so many come while the voltage moves by this share of its span, and by this many times
+#: the usual prediction error of the smoother: share, multiple, number of readings.
+STUCK_SHARE, STUCK_SIGMA, REPEATED = 0.002, 8.0, 4
 #: Sample time up to which ``glitch_share`` is not scaled, s.
 GLITCH_DT_S = 1e-3
 
@@ -53,11 +56,12 @@ SATURATED = "saturated"
 OUT_OF_RANGE = "out_of_range"
 UNEXCITED = "unexcited"
 OUTLIER = "outlier"
+REDUNDANT = "redundant"
 FROZEN = "frozen"
 NUMERICS = "numerics"
 REASONS = (
     NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, RINGING, UNTRUSTED, SETTLING, SATURATED, OUT_OF_RANGE,
-    UNEXCITED, OUTLIER, FROZEN, NUMERICS,
+    UNEXCITED, OUTLIER, REDUNDANT, FROZEN, NUMERICS,
 )  # fmt: skip
 
 
@@ -70,7 +74,9 @@ class AdmissionConfig:
     surprise_share, surprise_sigma : a reading this far from the smoother's prediction, as a share of the model's range
     at sample times of up to 1 ms (``at``), and this many times the usual error of the prediction, is held back until
     others tell what it is. glitch_share : a reading this far off is, however wrong the predictions usually are.
-    glitch_persistence : a jump is believed after more readings than that at the new level.
+    glitch_persistence : a jump is believed after more readings than that at the new level, ...
+    doubt_persistence : ... or than that where the sensor was wrong within ``doubt_s``, and for jumps outside
+    ``glitch_share`` to ``jump_share`` of the range.
     max_gap : most missing samples that are bridged; after more, the smoother restarts.
     settle : samples after a (re)start that are not learnt.
     timing_tolerance : relative error of the time step between two samples.
@@ -85,7 +91,10 @@ class AdmissionConfig:
     surprise_share: float = 0.002
     surprise_sigma: float = 12.0
     glitch_share: float = 0.012
-    glitch_persistence: int = 16
+    jump_share: float = 0.12
+    glitch_persistence: int = 12
+    doubt_persistence: int = 16
+    doubt_s: float = 10.0
     max_gap: int = 25
     settle: int = 50
     timing_tolerance: float = 0.5
@@ -98,11 +107,11 @@ class AdmissionConfig:
                 raise InputError(
                     f"admission.{low}, {high}: got {getattr(self, low)}, {getattr(self, high)}, expected {low} < {high}"
                 )
-        positive = ("surprise_share", "surprise_sigma", "glitch_share", "rest_share", "rest_s")
+        positive = ("surprise_share", "surprise_sigma", "glitch_share", "jump_share", "rest_share", "rest_s")
         for name in (*positive, "timing_tolerance"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a positive number")
-        for name in ("glitch_persistence", "max_gap", "settle"):
+        for name in ("glitch_persistence", "doubt_persistence", "max_gap", "settle", "doubt_s"):
             if getattr(self, name) < 0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a number, not negative")
 
@@ -119,6 +128,7 @@ class AdmissionState:
     seq: Annotated[int, Entry("number of the last sample taken, -1 before any", low=-1)] = -1
     t_s: Annotated[float, Entry("its time", "s")] = 0.0
     since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
+    since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
     moved: Annotated[int, Entry("the smoother's count when the stage last left a place", low=0)] = 0
     anchor_um: Annotated[float, Entry("where the stage then was", "µm")] = 0.0
     u_V: Annotated[float, Entry("the last voltage", "V")] = 0.0
@@ -126,10 +136,16 @@ class AdmissionState:
     kink_V: Annotated[float, Entry("largest kink of the voltage of late, fading", "V", low=0.0)] = 0.0
     innovation2: Annotated[float, Entry("mean square error of the smoother's predictions", "ranges²", low=0.0)] = 0.0
 
+    y_um: Annotated[float, Entry("the last reading", "µm")] = 0.0
+    same: Annotated[int, Entry("how many readings in a row are equal to it", low=0)] = 0
+    low_V: Annotated[float, Entry("lowest voltage meanwhile", "V")] = 0.0
+    high_V: Annotated[float, Entry("highest voltage meanwhile", "V")] = 0.0
+
     @shared
-    def take(self, sample: Sample) -> None:
-        """Note a sample that has passed `check_sample`."""
+    def take(self, sample: Sample, steps: int) -> None:
+        """Note a sample that has passed `check_sample`, ``steps`` sample times after the last one."""
         self.seq, self.t_s = sample.seq, sample.t_s
+        self.since_glitch += steps
 
     def restart(self) -> None:
         """The smoother starts again."""
@@ -139,6 +155,10 @@ class AdmissionState:
     def step(self) -> None:
         """The smoother makes a step."""
         self.since_start += 1
+
+    def note_glitch(self) -> None:
+        """The sensor was found to have been wrong until now."""
+        self.since_glitch = 0
 
 
 @shared
@@ -206,6 +226,20 @@ def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation:
 
 
 @shared
+def check_repeats(state: AdmissionState, sample: Sample, span_V: float) -> str:
+    """Gate of a reading that is the last one again while the voltage moves. Call it with every reading."""
+    u_V = sample.u_V
+    if sample.y_um != state.y_um:
+        state.y_um, state.same, state.low_V, state.high_V = sample.y_um, 1, u_V, u_V
+        return ""
+    state.same += 1
+    state.low_V, state.high_V = min(state.low_V, u_V), max(state.high_V, u_V)
+    share = max(STUCK_SHARE, STUCK_SIGMA * state.innovation2**0.5)
+    moved = state.high_V - state.low_V > share * span_V
+    return GLITCH if state.same >= REPEATED and moved else ""
+
+
+@shared
 def settling(config: AdmissionConfig, state: AdmissionState) -> bool:
     """Whether the smoother has just started: it does not know the velocity yet."""
     return state.since_start <= config.settle
@@ -240,6 +274,7 @@ class EnvelopeConfig:
     part, at every point.
     jump : largest jump, as a share of the range, that is accepted from some readings at one level. A larger change is
     accepted only after motion has confirmed it.
+    drift_per_s : largest share of the range, a second, by which readings may drift away from the voltage.
     follow_s : time of motion over which readings must follow the drive before they are trusted again, s.
     """
 
@@ -247,12 +282,13 @@ class EnvelopeConfig:
     offset: float = 0.3
     shape: float = 0.25
     jump: float = 0.12
+    drift_per_s: float = 0.8
     follow_s: float = 0.15
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.gain) and self.gain > 1.0):
             raise InputError(f"envelope.gain: got {self.gain}, expected a factor above 1")
-        for name in ("offset", "shape", "jump", "follow_s"):
+        for name in ("offset", "shape", "jump", "drift_per_s", "follow_s"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"envelope.{name}: got {value}, expected a positive finite number")

@@ -123,18 +123,28 @@ def _fit(r: FloatArray, noise: float, out: FloatArray) -> None:  # pragma: no co
         out[1] = math.sqrt(max(variance, noise * noise) * max(spread, 0.0))
 
 
+#: Fewest readings in a row at the expected level that end a hold.
+BACK_AGAIN = 2
 #: Most samples without a reading that dead reckoning bridges.
 MOST_BRIDGED = 4096
-#: Longest hold of undecided readings, and of ringing about the old level, s.
-UNDECIDED_S, RINGING_S = 0.04, 0.6
+#: Longest hold of undecided readings, and of ringing about the old level, s; fewest samples for the first.
+UNDECIDED_S, RINGING_S, UNDECIDED_SAMPLES = 0.04, 0.6, 40
+#: A jump is a change of gain if the displacement changes by a ratio between this and its inverse, else an offset.
+JUMP_RATIO = 0.85
+#: Tolerance of the old level: this share of the travelled distance, at most this share of the range.
+WAY_SHARE, WAY_MOST = 0.03, 0.02
+#: A level is known if its standard deviation is below this share of the level, or of the tolerance.
+LEVEL_STD, USUAL_STD = 0.03, 0.3
 #: Most values for a level, and the shortest time between two of them, s. With shorter spacing, noise hides the
 #: curvature of a mode.
 VALUES, SPACING_S = 64, 5e-4
+#: Time that readings at a new level must span, s: a glitch of the sensor's electronics lasts some milliseconds.
+SPAN_S = 0.008
 #: Number of values in the shorter windows that are tried after the longest.
-WINDOWS = (VALUES // 2, VALUES // 4)
-#: Time for which readings must be at a level, the expected or a new one, s: longer than a half swing of a stage lies
-#: within the tolerance, and than a glitch of the sensor's electronics lasts.
-CALM_S = 0.01
+WINDOWS = (28, 16)
+#: Time for which readings must be at the expected level, s, and the same within ``UNDECIDED_S`` of ringing: one half
+#: swing lies within the tolerance.
+CALM_S, CALM_RINGING_S = 0.005, 0.01
 
 
 class Verdict(Enum):
@@ -157,6 +167,7 @@ class Circumstances(NamedTuple):
     usual_um : largest distance of an ordinary reading from the prediction.
     rest_um : reading of the stage at rest without voltage.
     low_um, high_um : readings at the ends of the identified range.
+    trusted : no sensor fault lately.
     """
 
     config: AdmissionConfig
@@ -168,10 +179,11 @@ class Circumstances(NamedTuple):
     rest_um: float
     low_um: float
     high_um: float
+    trusted: bool
 
 
 @dataclass(slots=True)
-class HeldReadings:
+class Hold:
     """Held samples, and the quantities that `judge` uses."""
 
     reckoning: Annotated[Reckoning, Entry("dead reckoning since the last trusted reading")]
@@ -222,10 +234,17 @@ class HeldReadings:
 
 def tolerance_um(now: Circumstances, reckoning: Reckoning) -> float:
     """Largest distance of a good reading from the dead-reckoned position, µm; it grows with the travelled distance."""
-    return now.usual_um + reckoning.std_um
+    way_um = min(WAY_SHARE * reckoning.way_um, WAY_MOST * now.range_um)
+    return now.usual_um + way_um + reckoning.std_um
 
 
-def judge(hold: HeldReadings, now: Circumstances) -> Verdict:
+def needed(config: AdmissionConfig, away_um: float, range_um: float, trusted: bool) -> int:
+    """Number of readings at one level that a jump must exceed."""
+    usual = config.glitch_share <= abs(away_um) / range_um <= config.jump_share
+    return config.glitch_persistence if trusted and usual else config.doubt_persistence
+
+
+def judge(hold: Hold, now: Circumstances) -> Verdict:
     """Decision after the last sample of a hold. Updates the hold; for JUMP also its ``level`` and ``away_um``."""
     n = len(hold.y_um)
     away_um = hold.y_um[-1] - hold.expected_um
@@ -235,7 +254,9 @@ def judge(hold: HeldReadings, now: Circumstances) -> Verdict:
         hold.good += 1
         # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,
         # readings must stay for CALM_S, because a ringing stage passes the expected level again and again.
-        return Verdict.BACK if hold.good >= round(CALM_S / now.dt_s) or n <= 2 else Verdict.WAIT
+        rings = hold.rang and (n - hold.rang) * now.dt_s <= UNDECIDED_S
+        enough = max(BACK_AGAIN, round((CALM_RINGING_S if rings else CALM_S) / now.dt_s))
+        return Verdict.BACK if hold.good >= enough or n <= 2 else Verdict.WAIT
     hold.good = 0
     hold.seen_um = max(hold.seen_um, abs(away_um))
     if hold.reckoning.lost:
@@ -249,14 +270,13 @@ def judge(hold: HeldReadings, now: Circumstances) -> Verdict:
     waited = n - max(hold.jumped, hold.silent)
     if hold.rang and (n - hold.rang) * now.dt_s <= 0.5 * UNDECIDED_S:
         return Verdict.WAIT if waited * now.dt_s < RINGING_S else Verdict.MOTION
-    # At a slow rate a jump must still be able to show.
-    if waited < max(2 * now.config.glitch_persistence, UNDECIDED_S / now.dt_s):
+    if waited < max(UNDECIDED_SAMPLES, UNDECIDED_S / now.dt_s):
         return Verdict.WAIT
     small = hold.seen_um <= now.config.glitch_share * now.range_um
     return Verdict.MOTION if small and not hold.taken else Verdict.LOST
 
 
-def _level(hold: HeldReadings, now: Circumstances, stride: int) -> Verdict | None:
+def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
     """JUMP if the readings have settled at a new level, WAIT if they ring about the old one, None if undecided."""
     y, old = np.array(hold.y_um), hold.slope * np.array(hold.old_um) + hold.shift_um
     missing = np.flatnonzero(np.isnan(y))
@@ -275,7 +295,7 @@ def _level(hold: HeldReadings, now: Circumstances, stride: int) -> Verdict | Non
             scaled = level_of(r / position * position[-1], noise)
             if scaled.residual <= levels[0].residual:
                 levels.insert(0, scaled)
-        level = next((fit for fit in levels if SIGMA * fit.std <= usual_um), None)
+        level = next((fit for fit in levels if _known(fit, usual_um)), None)
         if level is None:
             continue
         if abs(level.at) + SIGMA * level.std < usual_um:
@@ -293,7 +313,12 @@ def _spaced(x: FloatArray, stride: int) -> FloatArray:
     return x if stride == 1 else x.reshape(-1, stride).mean(axis=1)
 
 
-def _is_jump(level: Level, hold: HeldReadings, count: int, r: FloatArray, usual_um: float, now: Circumstances) -> bool:
+def _known(level: Level, usual_um: float) -> bool:
+    """Whether the standard deviation of a level is small enough for a decision."""
+    return level.std <= max(LEVEL_STD * abs(level.at), USUAL_STD * usual_um)
+
+
+def _is_jump(level: Level, hold: Hold, count: int, r: FloatArray, usual_um: float, now: Circumstances) -> bool:
     """Whether a level is a jump: significant, long enough, and allowed by the envelope."""
     away = abs(level.at)
     # Outside of the identified range the model itself may have an error as large as this.
@@ -301,7 +326,7 @@ def _is_jump(level: Level, hold: HeldReadings, count: int, r: FloatArray, usual_
         return False
     if away - usual_um <= SIGMA * level.std or away > now.envelope.jump * now.range_um:
         return False
-    if count <= now.config.glitch_persistence or count * now.dt_s < CALM_S:
+    if count <= needed(now.config, level.at, now.range_um, now.trusted) or count * now.dt_s < SPAN_S:
         return False
     # The level must lie within the measured distances, and must not exceed the motion of the readings.
     spread = 3.0 * now.noise_um
@@ -312,16 +337,16 @@ def _is_jump(level: Level, hold: HeldReadings, count: int, r: FloatArray, usual_
     return away <= moved
 
 
-def jump_after(frame: FeatureMap, envelope: EnvelopeConfig, at_um: float, away_um: float) -> tuple[float, float]:
+def jump_after(frame: FeatureMap, at_um: float, away_um: float) -> tuple[float, float]:
     """(slope, shift in µm) of a jump by ``away_um`` at the reading ``at_um``: a reading y becomes slope y + shift.
 
     One jump does not show whether the gain or the offset has changed. A change of gain about the rest position is
-    assumed where a stage can have it; the filter corrects it as the stage moves.
+    assumed if the displacement is large enough; the filter corrects it as the stage moves.
     """
     rest_um = frame.offset_um + frame.gain * frame.y_rest_um
     displacement_um = at_um - rest_um
     ratio = 1.0 + away_um / displacement_um if displacement_um else math.inf
-    if envelope.gain_allows(ratio):
+    if JUMP_RATIO < ratio < 1.0 / JUMP_RATIO:
         return ratio, (1.0 - ratio) * rest_um
     return 1.0, away_um
 
@@ -331,13 +356,13 @@ def frame_after(frame: FeatureMap, slope: float, shift_um: float) -> FeatureMap:
     return replace(frame, gain=slope * frame.gain, offset_um=slope * frame.offset_um + shift_um)
 
 
-def steps_of_motion(hold: HeldReadings) -> tuple[Step, ...]:
+def steps_of_motion(hold: Hold) -> tuple[Step, ...]:
     """The held samples as steps of the track, where all readings were motion of the stage."""
     y_um = np.array(hold.y_um)
     return _steps_of(hold, y_um, np.isnan(y_um))
 
 
-def steps_of_hold(hold: HeldReadings, usual_um: float) -> tuple[Step, ...]:
+def steps_of_hold(hold: Hold, usual_um: float) -> tuple[Step, ...]:
     """The held samples as steps of the track, once readings are as expected again; earlier readings are bridged."""
     y_um, n = np.array(hold.y_um), len(hold.y_um)
     expected_um = hold.slope * np.array(hold.old_um) + hold.shift_um
@@ -353,7 +378,7 @@ def steps_of_hold(hold: HeldReadings, usual_um: float) -> tuple[Step, ...]:
     return _steps_of(hold, np.where(good, y_um, bridged), ~good)
 
 
-def _steps_of(hold: HeldReadings, y_um: FloatArray, bad: BoolArray) -> tuple[Step, ...]:
+def _steps_of(hold: Hold, y_um: FloatArray, bad: BoolArray) -> tuple[Step, ...]:
     """The held samples as steps of the track; where (n,) ``y_um`` is NaN, the expected reading is used."""
     filled_um = np.where(np.isnan(y_um), hold.slope * np.array(hold.old_um) + hold.shift_um, y_um)
     return tuple(Step(float(y), u, not no) for y, u, no in zip(filled_um, hold.u_V, bad, strict=True))

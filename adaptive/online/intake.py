@@ -28,18 +28,36 @@ from dehyst.adaptive.online import glitch_or_jump as hypotheses
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
 from dehyst.adaptive.online.gates import AdmissionState
-from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, HeldReadings, Verdict
+from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from dehyst.adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
 from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following, Outcome, Trial
-from dehyst.adaptive.online.track import IntakeResult, Pair, Past, Step, Track
+from dehyst.adaptive.online.track import Pair, Past, Step, Taken, Track
 from dehyst.adaptive.smoothing import smoother_of
 from dehyst.adaptive.state import Entry, restore, save
 from dehyst.adaptive.types import FloatArray, Sample
 
 #: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5
-#: Most credit of a model: looks at which it was valid, less those at which it was not.
-CREDIT = 3
+#: Limits of the motion over the smoother's lag, as shares of the motion that the voltage causes by the mean slope;
+#: checked where that is more than this share of the range and this many deviations. Hysteresis is included.
+LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
+#: Time between two such checks, s.
+LOOK_S = 0.002
+#: A reading that repeats for this time, s, while the voltage moves, is a fault of the sensor and no missing reading.
+REPEATED_S = 0.1
+#: Share of the identified range beyond its ends up to which the model is valid.
+KNOWN = 0.05
+#: Largest deviation of a reckoned place, as a share of the range, for a hold to begin from a past place.
+PAST_SHARE = 0.02
+#: Age of a place that is certainly from before a fault that is detected now, s.
+CLEAN_S = 0.06
+#: Control trials: most credit of a model, which may judge only with some; what it begins with, so that a model that was
+#: never right judges no sensor; passed trials that a failed one takes away; time to the next while it has full credit,
+#: and while not, s; windows after which one has shown nothing.
+CREDIT, FIRST_CREDIT, FAILURE, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 2, 5.0, 0.3, 4
+
+#: Rates of the voltage above the largest known ones by this factor are unknown motion, in which no reading is judged.
+BEYOND = 1.25
 
 Model = Callable[[], LssvmInverse]
 
@@ -50,13 +68,15 @@ def is_known(known: FloatArray, slope: float, bend: float) -> bool:
 
     Only there the model can tell a wrong reading from motion that it has not learnt yet.
     """
-    return bool(abs(slope) <= known[0] and abs(bend) <= known[1])
+    return bool(abs(slope) <= BEYOND * known[0] and abs(bend) <= BEYOND * known[1])
 
 
 @shared
-def credit_after(credit: int, valid: bool) -> int:
-    """The credit of a model after one more look. Without credit it judges no sensor: its own errors are as large."""
-    return min(credit + 1, CREDIT) if valid else max(credit - 1, 0)
+def lags(gates: AdmissionState, x_um: float, dy_um: float, range_um: float) -> bool:
+    """Whether the reading has moved by ``dy_um`` while the voltage stands for ``x_um``, far beyond the usual error."""
+    if abs(x_um) <= LAGS_SHARE * range_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
+        return False
+    return bool(abs(x_um) > LAGS_SIGMA * gates.innovation2**0.5 * range_um)
 
 
 class Intake:
@@ -68,14 +88,18 @@ class Intake:
     ]
     following: Annotated[Following, Entry("check that the readings follow the drive")]
     track: Annotated[Track | None, Entry("of the stage, before the first reading none")]
-    _hold: Annotated[HeldReadings | None, Entry("readings that are held back")]
+    _hold: Annotated[Hold | None, Entry("readings that are held back")]
     _trial: Annotated[Trial | None, Entry("trial of the sensor")]
+    _control: Annotated[Trial | None, Entry("control trial: it judges readings that are trusted")]
     missing: Annotated[MissingMotion | None, Entry("a gap of which the motion is not known yet")]
     _proven: Annotated[FeatureMap | None, Entry("the frame before the first jump that is not confirmed")]
     _proven_past: Annotated[Past | None, Entry("a place from then")]
     _pasts: Annotated[list[Past], Entry("places in which the readings followed, older first", name="past", most=2)]
     _lost: Annotated[bool, Entry("whether the smoother has to start again")]
-    credit: Annotated[int, Entry("looks at which the model was valid, less the others", low=0, high=CREDIT)]
+    _calm: Annotated[int, Entry("samples since readings were last held back", low=0)]
+    _credit: Annotated[int, Entry("passed control trials; without any the model judges no sensor", high=CREDIT)]
+    _until_control: Annotated[int, Entry("samples until the next control trial")]
+    _look_from: Annotated[int, Entry("samples since the start from which on it is looked again for lags", low=0)]
     _reckoned_seq: Annotated[int, Entry("the last sample that has advanced the place", low=-1)]
     restarts: Annotated[int, Entry("restarts of the smoother", low=0)]
     jumps: Annotated[int, Entry("jumps taken", low=0)]
@@ -94,6 +118,8 @@ class Intake:
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.missing = None
+        self._look_every = max(1, round(LOOK_S / self.dt_s))
+        self._least_um = LAGS_SHARE * self.range_um
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
         self._envelope = config.envelope
@@ -103,12 +129,17 @@ class Intake:
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
         self._proven = None
         self._proven_past = None
+        self._calm = 1_000_000  # Samples since readings were last held back.
         # A model that does not depend on the displacement cannot check a sensor.
         self._tells = answers(base)
-        self._drive_V = drive_V(base)
+        self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
         self.known = known_rates(base)
-        self.credit = 0  # A model that was never right judges no sensor.
+        # A control trial judges readings that are trusted. A fault that it finds is the model's, and costs the model
+        # credit: without credit the model may not judge the sensor. Samples until the next control trial.
+        self._control = None
+        self._credit, self._until_control = FIRST_CREDIT, 0
         self._reckoned_seq = -1  # The last sample that has advanced the place, with a reading or without.
+        self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
         # Places from before the last steps in which the readings followed the drive, the older one first.
         self._pasts = []
 
@@ -120,7 +151,7 @@ class Intake:
     @property
     def _judges(self) -> bool:
         """Whether the model is good enough to judge the sensor."""
-        return self._tells and self.credit > 0
+        return self._tells and self._credit > 0
 
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number."""
@@ -134,6 +165,7 @@ class Intake:
         """Forget how the readings followed so far."""
         self.following.forget()
         self._pasts.clear()
+        self._control = None
 
     @property
     def fault(self) -> str:
@@ -152,7 +184,7 @@ class Intake:
 
     # ---- what a sample is
 
-    def take(self, sample: Sample, model: Model, doubt_V: float, recent_V: float) -> IntakeResult:
+    def take(self, sample: Sample, model: Model, doubt_V: float, recent_V: float) -> Taken:
         """Judge one sample; ``model`` returns the served model, for dead reckoning if needed.
 
         ``doubt_V`` : standard deviation of the model's predictions, V; ``recent_V`` : of the most recent ones. Never
@@ -163,7 +195,7 @@ class Intake:
         refused = self._refusal(sample)
         if refused:
             if gates.seq < 0 or self._refusal(replace(sample, y_um=self._middle_um)):
-                return IntakeResult(refused)
+                return Taken(refused)
             # Only the reading is wrong. The stage moves all the same: the sample is one without a reading.
             sample = replace(sample, y_um=nan)
         missing = sample.seq - self._reckoned_seq - 1 if gates.seq >= 0 else 0
@@ -171,14 +203,15 @@ class Intake:
         for u in (*between, sample.u_V):
             admission.watch_voltage(gates, u)
         if not refused:
-            gates.take(sample)
+            gates.take(sample, sample.seq - gates.seq if gates.seq >= 0 else 1)
         self._reckoned_seq = sample.seq
         if self._trial is not None:
             return self._try(self._trial, sample, between, refused)
+        refused = refused or admission.check_repeats(gates, sample, self.base.span_V)
         if track is None or self._lost or missing > c.max_gap or ((missing or refused) and track.motion is None):
             if refused:
                 self._lost = True
-                return IntakeResult(refused)
+                return Taken(refused)
             return self._after_gap(sample, missing, model)
         for u in between:
             self._keep(track, model, u, nan)
@@ -187,12 +220,17 @@ class Intake:
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and gates.since_start > c.settle and is_known(self.known[0], *track.rates_now)
         limit = admission.surprise(c, gates, self.base.span_V)
+        if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
+            self._hold = self._lagging(track, model(), sample.y_um)
         doubtful = known and abs(innovation) > limit
         # Held readings count too, except while they ring: an error that repeats becomes the usual error.
         if self._hold is None or not self._hold.rang:
             admission.watch_innovation(c, gates, innovation)
         if self._hold is None and not doubtful:
-            return IntakeResult("", (Step(sample.y_um, sample.u_V),))
+            self._until_control -= 1
+            if known and self.missing is None and (self._control is not None or self._until_control <= 0):
+                self._check_model(track, sample, model)
+            return Taken("", (Step(sample.y_um, sample.u_V),))
         # Dead reckoning knows the motion that a kink of the voltage causes; only the smoother does not.
         limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
         return self._decide(sample, track, self._keep(track, model, sample.u_V, sample.y_um), limit)
@@ -213,16 +251,18 @@ class Intake:
         slope_V = (u_V - before_V) / (missing + 1)
         return [before_V + slope_V * (i + 1) for i in range(min(missing, MOST_BRIDGED))]
 
-    def _without_reading(self, hold: HeldReadings, refused: str) -> IntakeResult:
-        """A held sample whose reading was refused; after too many of them the readings go on trial, or begin anew."""
-        if len(hold.y_um) < MOST_BRIDGED:
-            return IntakeResult(refused)
+    def _without_reading(self, hold: Hold, refused: str) -> Taken:
+        """A held sample whose reading was refused. A sensor that repeats itself for long goes on trial; after too many
+        other refused readings, the next one begins anew."""
+        repeats = refused == admission.GLITCH and len(hold.y_um) * self.dt_s >= REPEATED_S
+        if len(hold.y_um) < MOST_BRIDGED and not (repeats and self._judges):
+            return Taken(refused)
         if self._judges:
             return self._begin_trial(hold.reckoning)
         self._hold, self._lost = None, True
-        return IntakeResult(refused)
+        return Taken(refused)
 
-    def _after_gap(self, sample: Sample, missing: int, model: Model) -> IntakeResult:
+    def _after_gap(self, sample: Sample, missing: int, model: Model) -> Taken:
         """Begin smoothing anew after ``missing`` samples, 0 for an unknown number, or at the first sample."""
         track, earlier = self.track, self.missing
         from_um = sample.y_um if track is None else track.last_um
@@ -262,35 +302,90 @@ class Intake:
                 self.missing = None
         return self.missing is not None
 
-    def _restart(self, sample: Sample, why: str) -> IntakeResult:
+    def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
         self.missing = None
         self._hold, self._trial, self._lost = None, None, False
         self._proven_past = None
         self.gates.restart()
+        self._look_from = 0
         self._forget()
         if self.track is None:
             self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
         else:
             self.track.restart(sample.y_um)
         self.restarts += 1
-        return IntakeResult(why, (Step(sample.y_um, sample.u_V),))
+        return Taken(why, (Step(sample.y_um, sample.u_V),))
 
     # ---- readings held back
 
-    def _keep(self, track: Track, model: Model, u_V: float, y_um: float) -> HeldReadings:
-        """HeldReadings a sample back; begins a hold where there is none."""
+    def _keep(self, track: Track, model: Model, u_V: float, y_um: float) -> Hold:
+        """Hold a sample back; begins a hold where there is none."""
+        self._control = None
         if self._hold is None:
-            self._hold = self._begin_hold(track, model())
+            # Soon after another hold the readings are no anchor: some of them may have rung.
+            self._hold = self._begin_hold(track, model(), past=self._calm <= 2 * self.smoother.config.lag)
         self._hold.put(u_V, y_um)
         return self._hold
 
-    def _begin_hold(self, track: Track, model: LssvmInverse) -> HeldReadings:
-        """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed."""
+    def _check_model(self, track: Track, sample: Sample, model: Model) -> None:
+        """Control trial: would a trial of trusted readings find a fault?"""
+        if self._control is None:
+            if not self._tells:
+                return
+            self._control = Trial.begin(self._begin_hold(track, model()).reckoning, self.base, track.memory_now(True))
+        control = self._control
+        decision = control.put(sample.u_V, sample.y_um, self._circumstances(0.0))
+        done = decision.outcome is not Outcome.OPEN or bool(control.fault)
+        if not done and control.since * self.dt_s < CONTROL_WINDOWS * self._envelope.follow_s:
+            return
+        self._give_credit(-1 if control.fault else decision.credit)
+        self._control = None
+        self._until_control = round((CONTROL_S if self._credit == CREDIT else CONTROL_AGAIN_S) / self.dt_s)
+
+    def _give_credit(self, credit: int) -> None:
+        # A model that fails every second time would get credit now and then, and accuse a good sensor with it.
+        self._credit = min(max(self._credit + (credit if credit >= 0 else FAILURE * credit), -CREDIT), CREDIT)
+
+    def _lags(self, track: Track, y_um: float) -> bool:
+        """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
+
+        A sensor that stops gently surprises no smoother.
+        """
+        if not self._judges or not self._pasts or self.gates.since_start < self._look_from:
+            return False
+        du_V, dy_um = track.steps_over_lag(y_um)
+        return lags(self.gates, du_V / self._slope_V_per_um, dy_um, self.range_um)
+
+    def _lagging(self, track: Track, model: LssvmInverse, y_um: float) -> Hold | None:
+        """A hold, if the reading has not moved as the place has by reckoning: where the stage turns it moves little."""
+        past, lag = self._clean_past(), track.lag
+        reckoning = _from_past(past, self._of_track(track, model), len(past.u_V) - lag)
+        before_um = reckoning.y_um
+        for u in past.u_V[max(len(past.u_V) - lag, 0) :]:
+            reckoning.advance(u)
+        known = reckoning.std_um <= self._least_um
+        reckoning.begin_way()
+        dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
+        if known and abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
+            return Hold(reckoning, reckoning.y_um)
+        self._look_from = self.gates.since_start + lag
+        return None
+
+    def _begin_hold(self, track: Track, model: LssvmInverse, past: bool = False) -> Hold:
+        """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed.
+
+        ``past`` : or from where it was when the readings had followed the drive, where the last ones are in doubt too.
+        """
+        if past and self._pasts and self._judges:
+            reckoning = self._from_past(track, model)
+            # A place from long ago, over a long way, is no better than readings that may have rung.
+            if reckoning.std_um <= PAST_SHARE * self.range_um:
+                return Hold(reckoning, reckoning.y_um)
         motion, u_before_V, past_V, past_um = track.since_motion()
         reckoning = Reckoning.begin(self._of_track(track, model), motion, u_before_V, past_V, past_um, track.memory)
         last_um = float(past_um[-1]) if past_um.size else motion[0]
-        return HeldReadings(reckoning, last_um)
+        return Hold(reckoning, last_um)
 
     def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
         """From the last place that readings have confirmed, over the voltages since."""
@@ -299,7 +394,7 @@ class Intake:
     def _clean_past(self) -> Past:
         """The last place that readings have confirmed which is from before anything that is noticed now."""
         newest = self._pasts[-1]
-        return newest if len(newest.u_V) * self.dt_s > hypotheses.UNDECIDED_S else self._pasts[0]
+        return newest if len(newest.u_V) * self.dt_s > CLEAN_S else self._pasts[0]
 
     def _of_track(self, track: Track, model: LssvmInverse) -> LssvmInverse:
         """A model in the frame of the track: the identified one is served in its own, with a memory of its own."""
@@ -318,11 +413,12 @@ class Intake:
             noise_um=max(gates.innovation2**0.5, c.surprise_share / c.surprise_sigma) * self.range_um,
             usual_um=usual * self.range_um,
             rest_um=served.offset_um + served.gain * served.y_rest_um,
-            low_um=served.offset_um + served.gain * served.y_min_um,
-            high_um=served.offset_um + served.gain * served.y_max_um,
+            low_um=served.offset_um + served.gain * (served.y_min_um - KNOWN * self.range_um),
+            high_um=served.offset_um + served.gain * (served.y_max_um + KNOWN * self.range_um),
+            trusted=gates.since_glitch * self.dt_s > c.doubt_s,
         )
 
-    def _decide(self, sample: Sample, track: Track, hold: HeldReadings, limit: float) -> IntakeResult:
+    def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float) -> Taken:
         """The decision after the last sample held back."""
         now = self._circumstances(limit)
         verdict = hypotheses.judge(hold, now)
@@ -330,27 +426,30 @@ class Intake:
             return self._take_jump(sample, track, hold, now)
         if verdict is Verdict.WAIT:
             if hold.rang or hold.taken:
-                return IntakeResult(admission.RINGING)
+                return Taken(admission.RINGING)
             # A hold that waits for missing readings has seen no wrong one.
-            return IntakeResult(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
+            return Taken(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
         if verdict is Verdict.LOST:
             return self._give_up(sample, hold)
         self._hold = None
         if verdict is Verdict.MOTION:
-            return IntakeResult("", hypotheses.steps_of_motion(hold))
-        return IntakeResult("", hypotheses.steps_of_hold(hold, now.usual_um))
+            return Taken("", hypotheses.steps_of_motion(hold))
+        if hold.seen_um > self._admission.glitch_share * self.range_um and not (hold.taken or hold.rang):
+            self.gates.note_glitch()
+        self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
 
-    def _give_up(self, sample: Sample, hold: HeldReadings) -> IntakeResult:
+    def _give_up(self, sample: Sample, hold: Hold) -> Taken:
         """An unexplained hold: begin a trial, or restart where the model may not judge the sensor."""
         return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
 
-    def _take_jump(self, sample: Sample, track: Track, hold: HeldReadings, now: Circumstances) -> IntakeResult:
+    def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
         """The readings have settled at another level: move frame and place.
 
         No voltage caused this jump, so the hysteresis memory stays. A jump back is another jump.
         """
         f, away_um = track.served, hold.away_um
-        slope, shift_um = hypotheses.jump_after(f, self._envelope, hold.expected_um, away_um)
+        slope, shift_um = hypotheses.jump_after(f, hold.expected_um, away_um)
         frame = hypotheses.frame_after(f, slope, shift_um)
         if self._envelope.refuses(self.base.features, frame):
             return self._give_up(sample, hold)
@@ -364,9 +463,9 @@ class Intake:
         self._forget()
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
             # It rings about the new level: the frame is right, wait for settled readings.
-            return IntakeResult(admission.RINGING, (), away_um, first=first)
+            return Taken(admission.RINGING, (), away_um, first=first)
         self._hold = None
-        return IntakeResult("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, first=first)
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, first=first)
 
     # ---- readings on trial
 
@@ -391,7 +490,7 @@ class Intake:
         self._begin_trial(reckoning)
         return True
 
-    def _begin_trial(self, reckoning: Reckoning) -> IntakeResult:
+    def _begin_trial(self, reckoning: Reckoning) -> Taken:
         track, proven = self.track, self._proven
         assert track is not None
         if proven is not None:
@@ -405,9 +504,9 @@ class Intake:
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), by_voltages=not self._judges)
         self.trials += 1
         self._forget()
-        return IntakeResult(admission.UNTRUSTED, distrusted=True)
+        return Taken(admission.UNTRUSTED, distrusted=True)
 
-    def _try(self, trial: Trial, sample: Sample, between: list[float], refused: str) -> IntakeResult:
+    def _try(self, trial: Trial, sample: Sample, between: list[float], refused: str) -> Taken:
         """One sample of a sensor on trial, after missing ones with the voltages ``between``, V.
 
         ``refused`` : the gate that refused its reading, or "".
@@ -417,10 +516,11 @@ class Intake:
         for u in between if not refused else (*between, sample.u_V):
             trial.put(u, nan, self._circumstances(0.0))
         if refused:
-            return IntakeResult(refused)
+            return Taken(refused)
         decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
         if decision.outcome is Outcome.OPEN:
-            return IntakeResult(admission.UNTRUSTED, renamed=trial.fault != fault)
+            return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+        self._give_credit(min(decision.credit, 0))
         track = self.track
         assert track is not None
         frame, away_um = track.served, 0.0
@@ -429,11 +529,12 @@ class Intake:
             refused = self._envelope.refuses(self.base.features, frame)
             if refused:
                 trial.refuse(refused)
-                return IntakeResult(admission.UNTRUSTED, renamed=trial.fault != fault)
+                return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
             away_um = sample.y_um - trial.reckoning.y_um
             self.jumps += 1
         before = track.served
         track.enter(frame)
+        self.gates.note_glitch()
         taken = self._restart(sample, admission.SETTLING)
         track.remember(trial.reckoning.memory)
         first = decision.outcome is Outcome.CHANGED
@@ -475,6 +576,11 @@ class Intake:
         return self.track.memory_now(frozen)
 
     @property
+    def controls(self) -> bool:
+        """Whether a control trial of the model is under way."""
+        return self._control is not None
+
+    @property
     def begins(self) -> bool:
         """Whether the next sample cannot teach anything, because the smoother has just started."""
         smooths = self.track is not None and self.track.motion is not None
@@ -491,6 +597,7 @@ class Intake:
             or track.features != track.served
             or self.holds
             or self.missing is not None
+            or self._control is not None
             or self._proven is not None
             or self._proven_past is not None
         )
@@ -501,6 +608,7 @@ class Intake:
         """One step of the track; see there."""
         assert self.track is not None
         self.gates.step()
+        self._calm += 1
         for past in self._pasts:
             past.u_V.append(step.u_V)
         if self._trial is not None or self._proven_past is not None:
@@ -555,7 +663,8 @@ class Intake:
             # Motion from before and after a jump cannot be compared.
             self._forget()
             return False
-        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
+        fastest_V_per_s = self._envelope.drift_per_s * self._drive_V
+        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s, fastest_V_per_s)
         known = is_known(self.known[0], *pair.rates)
         if not known:
             self.following.forget_slopes()
@@ -567,7 +676,7 @@ class Intake:
         if self._hold is None and (self.following.good >= CONFIRMED or not self._pasts):
             if self.following.good >= CONFIRMED:
                 self._proven = self._proven_past = None
-            self.following.good = 0
+            self.following.count_again()
             self._pasts = [*self._pasts[-1:], Past.of(track)]
         return fault
 
@@ -575,14 +684,6 @@ class Intake:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0
         return admission.at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
-
-    def smoothed(self) -> tuple[Pair, bool] | None:
-        """The last smoothed instant, and whether the stage moves; None before there is one."""
-        track = self.track
-        pair = None if track is None else track.pair()
-        if track is None or pair is None:
-            return None
-        return pair, (track.state.count - self.gates.moved) * self.dt_s <= self._admission.rest_s
 
     def learn_rates(self, rates: tuple[float, float]) -> None:
         """Motion with these rates of the voltage, V/s and V/s², has been learnt."""
@@ -598,7 +699,7 @@ class Intake:
     def given(self) -> dict[str, Any]:
         """What the records of a stored state do not hold themselves; see `adaptive.state.load`."""
         track = {"smoother": self.smoother, "base": self.base.features}
-        return {"track": track, "_trial": {"base": self.base}}
+        return {"track": track, "_trial": {"base": self.base}, "_control": {"base": self.base}}
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -621,10 +722,11 @@ def known_rates(base: LssvmInverse) -> FloatArray:
     return np.tile(fastest, (3, 1))
 
 
-def _from_past(past: Past, model: LssvmInverse) -> Reckoning:
-    """From a place in the past over the voltages since."""
+def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:
+    """From a place in the past over the voltages since; over the first ``upto`` of them where that is given."""
     reckoning = Reckoning.begin(model, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
-    for u in past.u_V:
+    for u in past.u_V if upto is None else past.u_V[: max(upto, 0)]:
         reckoning.advance(u)
-    reckoning.begin_way()
+    if upto is None:
+        reckoning.begin_way()
     return reckoning

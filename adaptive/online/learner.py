@@ -22,10 +22,10 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
-from dehyst.adaptive.online.drift import SLOW_S, DriftFilter, Mark, RestCreep
+from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from dehyst.adaptive.online.glitch_or_jump import level_of
-from dehyst.adaptive.online.intake import Intake, credit_after
+from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow, due
 from dehyst.adaptive.online.missing_motion import MissingMotion
 from dehyst.adaptive.online.track import Pair
@@ -50,8 +50,8 @@ from dehyst.adaptive.types import (
 # learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
 
 
-#: Time constant of the mean square errors that detect trouble, s; those for reports have the filter's ``SLOW_S``.
-SHORT_S = 0.1
+#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
+LONG_S, SHORT_S = 2.0, 0.1
 
 #: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
 FALLBACK_RATIO = 1.3
@@ -77,7 +77,7 @@ class Judgement:
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """Take one error of the learnt and of the frozen model, V."""
         squared = error_V * error_V
-        slow, fast = min(1.0, step_s / SLOW_S), min(1.0, step_s / SHORT_S)
+        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
         if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
             self.inside += 1
         self.error_V = error_V
@@ -166,6 +166,8 @@ ROLLBACK_S, MARK_S, REFERENCE_S = 0.5, 0.1, 1.0
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
+#: Time between two checks of the sensor, s; at least a step of the filter.
+CHECK_S = 0.004
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
 #: Largest move of the output at an adoption, in its stated standard deviations (rms over the newest samples).
@@ -177,6 +179,7 @@ class Parts:
 
     first : the filter's estimate of the identified model.
     window : the kernel part, whose state is among the entries ``window``.
+    check_every, check_s : samples between two checks of the sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     """
 
@@ -218,6 +221,8 @@ class Parts:
         self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
         self.rest = RestCreep()
         self.delay = Delay(round(config.serving_age_s / step_s))
+        steps = max(1, round(CHECK_S / self.filter.step_s))
+        self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
         # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
         if allowed_V is None:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
@@ -225,17 +230,26 @@ class Parts:
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
 
+    def expect_change(self) -> None:
+        """The stage has changed: the filter follows faster, and older samples of the window will count less."""
+        self.filter.expect_change()
+        self.window.expect_change()
+
     def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, rest: bool) -> bool:
         """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
         ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
         """
-        remainder_V = pair.u_V - float(basis.dot(self.filter.beta))
+        left_V = pair.u_V - float(basis.dot(self.filter.beta))
         said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest)
         if said == "outlier":
             return False
         if not rest:
-            self.window.weigh(kernel_V, remainder_V, self.filter.step_s)
+            self.window.weigh(kernel_V, left_V, self.filter.step_s)
+        if said == "burst":
+            self.window.expect_change()
+        if self.judgement.valid:
+            self.window.let_go(self.config.before_change)
         self.take_rest(pair.u_V, moving=not rest)
         if self.judgement.valid and not rest:
             self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
@@ -259,9 +273,6 @@ class Parts:
         span_V = self.filter.span_V
         j.take(error_V, frozen_error_V, step_s)
         j.decide(c.valid_enter * span_V, c.valid_leave * span_V)
-        looks = j.judged % max(1, round(REFERENCE_S / step_s)) == 0
-        if looks:
-            self.intake.credit = credit_after(self.intake.credit, j.valid)
         before = j.fallback
         self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
         if j.fallen_s > ROLLBACK_S:
@@ -277,22 +288,27 @@ class Parts:
         elif j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             if j.judged % max(1, round(MARK_S / step_s)) == 0:
                 self.mark, self.next_mark = self.next_mark, self.filter.mark()
-            if looks:
+            if j.judged % max(1, round(REFERENCE_S / step_s)) == 0:
                 self.references[0], self.references[1] = self.references[1], self.filter.beta
                 self.intake.mark_rates()
 
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
+        self.window.keep()
         self.events["distrusts"] += 1
 
     def take_jump(self, jump_um: float, first: bool) -> None:
-        """The frame has moved by ``jump_um``, µm; ``first``: see ``IntakeResult``."""
+        """The frame has moved by ``jump_um``, µm; ``first``: see ``Taken``."""
         intake = self.intake
         self.judgement.add_doubt((JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2)
         if first:
-            self.mark = self.next_mark = self.filter.mark()
-            self.references[:] = self.mark.beta
+            self._mark_now()
+
+    def _mark_now(self) -> None:
+        """The present estimate is the one to return to."""
+        self.mark = self.next_mark = self.filter.mark()
+        self.references[:] = self.mark.beta
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
@@ -419,7 +435,8 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     window.with_hyperparameters(window.hyper).newest_error_V(1)
     for moving in (True, False):
         parts.filter.update(basis, 0.0, moving)
-    parts.filter.expect_change()
+    parts.expect_change()
+    window.let_go(0.5)
 
 
 class Learner:
@@ -501,7 +518,7 @@ class Learner:
         if taken.jump_um:
             parts.take_jump(taken.jump_um, taken.first)
             if intake.track is not None and intake.track.features is intake.track.served:
-                parts.filter.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
+                parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
         moved = taken.jump_um or taken.distrusted or taken.renamed
         if moved or taken.refused == admission.GAP:
             self._cache = None
@@ -509,7 +526,7 @@ class Learner:
         for step in taken.steps:
             pair, switched = intake.advance(step)
             if switched:
-                parts.filter.expect_change()
+                parts.expect_change()
             if not taken.refused:
                 outcome = admission.SETTLING if pair is None else self.teach(pair)
         return outcome
@@ -540,9 +557,10 @@ class Learner:
         frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
         served_V = float(self._basis.dot(parts.delay.push(beta)))
         parts.judge(target - served_V, pair.u_V - frozen_V)
-        found = self._check(pair, target, bool(refused))
-        if found:
-            return found
+        if pair.now % parts.check_every == 0:
+            found = self._check(pair, target, bool(refused))
+            if found:
+                return found
         # Where nothing is learnt, the stated deviation is of the errors until now all the same.
         self._cache = None
         if refused:
@@ -576,7 +594,7 @@ class Learner:
         parts, intake = self.parts, self.parts.intake
         kernel_V = pair.u_V - target_V
         p_V = kernel_V + float(self._basis.dot(parts.references[0]))
-        if saturated or not intake.follow(pair, p_V, parts.filter.step_s):
+        if saturated or not intake.follow(pair, p_V, parts.check_s):
             return ""
         if not intake.distrust(self.snapshot):
             return ""
@@ -649,15 +667,6 @@ class Learner:
         if smoothed:
             return (intake.track.frozen_memory if frozen else intake.track.memory).copy()
         return intake.memory_now(frozen)
-
-    @property
-    def lag(self) -> int:
-        """Samples by which the smoothed instant is behind the last sample."""
-        return self.parts.intake.smoother.config.lag
-
-    def smoothed(self) -> tuple[Pair, bool] | None:
-        """The last smoothed instant, and whether the stage moves; None before there is one."""
-        return self.parts.intake.smoothed()
 
     @property
     def features(self) -> FeatureMap:
@@ -771,7 +780,7 @@ class Learner:
             "valid": float(j.valid),
             "fallback": float(j.fallback),
             "frozen": float(self._frozen),
-            "lag_s": self.lag * base.dt_s,
+            "lag_s": intake.smoother.config.lag * base.dt_s,
             "window_y_um": window_y_um.tolist(),
             "window_v_um_per_s": window_v_um_per_s.tolist(),
         }

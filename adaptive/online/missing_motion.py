@@ -38,15 +38,15 @@ FIRST_SHARE: Final = 0.01
 ALIKE: Final = 10.0
 #: The model's error after a gap over its rms error just before it, which differs along the motion.
 NOISE_FACTOR: Final = 2.0
+#: Least deviation of the model's error, as a share of the span.
+LEAST_SHARE: Final = 1e-4
 #: Distance, as a share of the range, at which the voltages are compared beside the place itself.
 PROBE_SHARE: Final = 0.15
 #: Steps of the filter between two comparisons.
 PROBE_EVERY: Final = 5
-#: Least deviation of the model's error, as a share of the span.
-LEAST_SHARE: Final = 3e-4
-#: The gap is closed where the spread is below the model's error. Each time in motion that has passed, s, adds as much:
-#: motion that tells little must not stop the learning. The longest time in motion, s.
-PATIENCE_S, LONGEST_S = 0.25, 1.0
+#: The gap is closed where the spread is below the model's error, or this share of the span. Each time in motion that
+#: has passed, s, adds as much: motion that tells little must not stop the learning. The longest time in motion, s.
+CLOSED_SHARE, PATIENCE_S, LONGEST_S = 3e-4, 0.25, 1.0
 
 
 @dataclass(slots=True)
@@ -135,7 +135,7 @@ class MissingMotion:
     @property
     def closed(self) -> bool:
         """Whether what is missing no longer matters, or has been waited for long enough."""
-        close_V = (1.0 + self.moved_s / PATIENCE_S) * self.noise_V
+        close_V = max((1.0 + self.moved_s / PATIENCE_S) * self.noise_V, CLOSED_SHARE * self.model.span_V)
         return self.std_V <= close_V or self.moved_s > LONGEST_S
 
     def compare(self, motion: tuple[float, float, float]) -> None:

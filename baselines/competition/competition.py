@@ -22,8 +22,7 @@ import numpy as np
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates
-from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.online.track import Pair
+from dehyst.adaptive.online.learner import Learner, Parts
 from dehyst.adaptive.state import Entry, Refused, load, part_of, restore, save
 from dehyst.adaptive.types import (
     FloatArray,
@@ -53,12 +52,8 @@ class Smooths(Protocol):
     """A learner that smooths the motion and judges the samples: the favourite."""
 
     @property
-    def lag(self) -> int:
-        """Samples by which the smoothed instant is behind the last sample."""
-        ...
-
-    def smoothed(self) -> tuple[Pair, bool] | None:
-        """The last smoothed instant, and whether the stage moves; None before there is one."""
+    def parts(self) -> Parts:
+        """Its changing state."""
         ...
 
 
@@ -96,7 +91,7 @@ def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseMode
 # predicts a stage at rest.
 
 #: Verdicts of the favourite on samples that are scored.
-_SCORED: Final = frozenset({gates.LEARNT, gates.PASSED, gates.OUTLIER, gates.FROZEN})
+_SCORED: Final = frozenset({gates.LEARNT, gates.PASSED, gates.REDUNDANT, gates.OUTLIER, gates.FROZEN})
 
 
 @dataclass(slots=True)
@@ -326,7 +321,7 @@ class Competition:
         self._smooths: Smooths = favourite
         first = tuple(model.snapshot() for model in self._models)
         self._dt_s, self._span_V = first[0].dt_s, span_V
-        self.judge = Judge(self.config, first, favourite.lag, span_V)
+        self.judge = Judge(self.config, first, favourite.parts.intake.smoother.config.lag, span_V)
         self._choice = ChampionChoice(self.config, span_V)
         self._newest = first
         self._serving = ChampionInverse(self.names, first, 0, self.config.blend_s)
@@ -418,11 +413,13 @@ class Competition:
 
     def _take_motion(self, verdict: str) -> None:
         """Take the instant that the favourite has just smoothed, if there is one; none while it holds readings."""
-        smoothed = self._smooths.smoothed()
-        if smoothed is None or smoothed[0].now == self._last:
+        parts = self._smooths.parts
+        gates, track = parts.intake.gates, parts.intake.track
+        pair = None if track is None else track.pair()
+        if track is None or pair is None or pair.now == self._last:
             return
-        pair, moves = smoothed
         self._last = pair.now
+        moves = (track.state.count - gates.moved) * self._dt_s <= parts.config.admission.rest_s
         scored = verdict in _SCORED and moves
         self._rows.append((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2, pair.u_V, float(scored)))
 

@@ -24,6 +24,7 @@ from dehyst.adaptive.online.gates import (
     NOT_FINITE,
     OUT_OF_RANGE,
     PASSED,
+    REDUNDANT,
     TIMING,
     UNEXCITED,
 )
@@ -64,7 +65,7 @@ NOT_LEARNING: Final = "not_learning"
 #: Verdict on samples of which neither voltage nor reading is believed.
 NOT_COMMANDED: Final = "not_commanded"
 #: Verdicts that are no refusal of a sample in motion.
-_NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, FROZEN, NOT_LEARNING})
+_NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
 #: What lets the learner follow such a change.
 _WIDEN: Final = {
     OUT_OF_ENVELOPE: "if it is real, identify again, or widen learner.envelope.gain or learner.envelope.offset",

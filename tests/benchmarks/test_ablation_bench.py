@@ -32,7 +32,6 @@ from benchmarks.ablation import (
     worse_cases,
     worse_rows,
 )
-from dehyst.adaptive.online import sensor_trust
 from dehyst.adaptive.online.glitch_or_jump import level_of
 from dehyst.adaptive.online.learner import Judgement
 
@@ -43,7 +42,7 @@ LIMIT: Final = 0.5
 COUNT, SHARE = 3, (0.6, 1.7)
 SLOPES = (0.0, 25.0)
 TURNS = (0.0, 0.1, 0.4)
-NAME, NONE, FLAG, ZERO, BELOW = "name", None, True, 0, -2.5
+NAME, NONE, FLAG, ZERO, NOWHERE, BELOW = "name", None, True, 0, -1, -2.5
 TWICE = 2 * OTHER
 def f():
     LOCAL = 3
@@ -121,7 +120,7 @@ def test_a_shift_reaches_compiled_code_and_what_calls_it() -> None:
 def test_a_shift_reaches_importers() -> None:
     def shifted() -> tuple[int, int]:
         shift(constant("sensor_trust.STILL_STEPS"), 40)
-        return ablation.intake.STILL_STEPS, sensor_trust.STILL_STEPS
+        return ablation.intake.STILL_STEPS, ablation.sensor_trust.STILL_STEPS
 
     assert in_a_process(shifted) == (40, 40)
 
@@ -210,7 +209,7 @@ def test_a_constant_that_matters_is_told_from_one_that_does_not(
 ) -> None:
     planned = [
         v
-        for label in ("learner.FALLBACK_RATIO", "learner.NEWEST", "drift.SLOW_S")
+        for label in ("learner.FALLBACK_RATIO", "learner.NEWEST", "learner.LONG_S")
         for v in variants_of(constant(label))
     ]
     path, to = tmp_path / "a.jsonl", tmp_path / "table.md"
@@ -218,10 +217,10 @@ def test_a_constant_that_matters_is_told_from_one_that_does_not(
     assert [row.measure for row in results.worse("learner.FALLBACK_RATIO twice")] == ["median"]
     assert not results.worse("learner.FALLBACK_RATIO half")
     # Gone through and the same, and not gone through: nothing was tried then.
-    assert "drift.SLOW_S half (8 cases run): the same" in capsys.readouterr().err
+    assert "learner.LONG_S half (8 cases run): the same" in capsys.readouterr().err
     _, nothing, worth, untested = to.read_text().split("###")
     assert nothing.startswith(" changes nothing, to the last bit (1)")
-    assert "drift.SLOW_S | 2.0 | the same | the same" in nothing
+    assert "learner.LONG_S | 2.0 | the same | the same" in nothing
     assert worth.startswith(" worth its place (1)")
     assert "learner.FALLBACK_RATIO | 1.3" in worth
     assert untested.startswith(" not tested by these cases (1)")
@@ -248,5 +247,5 @@ def test_what_raises_has_failed(cases: list[ablation.Case]) -> None:
 
 
 def test_lines_are_found_by_what_they_read() -> None:
-    places = readers_of("dehyst.adaptive.online.sensor_trust", "ENOUGH").places
-    assert text_of([at for at in places if "tests" not in Path(at[0]).parts]) == {"if self.count < ENOUGH:"}
+    lines = text_of(readers_of("dehyst.adaptive.online.sensor_trust", "STEP_STILL").places)
+    assert lines == {"self.still = self.still + 1 if", "self.driven = FORGET * self.driven +"}

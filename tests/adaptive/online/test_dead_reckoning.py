@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.dead_reckoning import (
+    CREEP_PER_S,
     LOST_SHARE,
     OFF_LINE,
     SLOPES,
@@ -19,6 +20,7 @@ from dehyst.adaptive.online.dead_reckoning import (
     mean_slope,
 )
 from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
@@ -81,9 +83,14 @@ def test_no_model_makes_it_run_off(model: LssvmInverse, seed: int, steps: list[f
     u = np.clip(4.0 + np.cumsum(steps), 0.0, 10.0)
     reckoning = Reckoning.begin(wrong, REST, 4.0, np.empty(0), np.empty(0), model.rest_memory(40.0))
     slope = mean_slope(wrong)
-    before, way_V = 4.0, 0.0
+    before, way_V, last, creep = 4.0, 0.0, 0.0, CREEP_PER_S * reckoning.range_um * DT
     for u_V in u:
+        held = reckoning.y_um
         place = reckoning.advance(float(u_V))
+        # In one sample: by the largest slope, by the motion under way, by creep.
+        caused = np.sign(slope) * (u_V - before) / (SLOPES[0] * abs(slope))
+        assert min(caused, 0.0) + min(last, -creep) - 1e-9 <= place - held <= max(caused, 0.0) + max(last, creep) + 1e-9
+        last = place - held
         way_V += abs(u_V - before)
         before = u_V
         assert abs(place - REST[0]) <= way_V / (SLOPES[0] * abs(slope)) + 1e-3 * reckoning.range_um + 1e-9
@@ -115,3 +122,11 @@ def test_uncertainty_grows_with_the_way_and_not_at_rest(model: LssvmInverse) -> 
     for _ in range(500):
         reckoning.advance(float(u_V))
     assert reckoning.std_um - moved < 0.01
+
+
+def test_state_goes_on_to_the_last_bit(model: LssvmInverse) -> None:
+    one = Reckoning.begin(model, REST, 4.0, np.full(3, 4.0), np.full(2, 40.1), model.rest_memory(40.0))
+    one.advance(4.1)
+    two = load(Reckoning, save(one))
+    assert [one.advance(u) for u in (4.2, 4.4, 4.3)] == [two.advance(u) for u in (4.2, 4.4, 4.3)]
+    np.testing.assert_array_equal(one.memory, two.memory)

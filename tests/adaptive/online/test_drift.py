@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isnan
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online import drift
 from dehyst.adaptive.online import drift as drift_step
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftConfig, DriftFilter, RestCreep
 from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, restore, save
 from dehyst.adaptive.types import Sample
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
@@ -98,6 +101,18 @@ def test_rest_opens_nothing_but_the_constant() -> None:
     np.testing.assert_allclose(f.beta, TRUE, atol=5e-3)
 
 
+def test_state_round_trip_goes_on_to_the_last_bit() -> None:
+    one = made()
+    feed(one, rows(100), 1.02 * TRUE)
+    two = made()
+    restore(two, save(one), {"p": TRUE.size})
+    for f in (one, two):
+        feed(f, rows(50, 5), 1.02 * TRUE)
+    np.testing.assert_array_equal(one.beta, two.beta)
+    np.testing.assert_array_equal(one.covariance, two.covariance)
+    assert one.state == two.state
+
+
 def test_bad_configuration_is_named() -> None:
     with pytest.raises(InputError, match="noise"):
         DriftConfig(noise=0.0)
@@ -105,6 +120,36 @@ def test_bad_configuration_is_named() -> None:
         DriftConfig(gain_walk=-1.0)
     with pytest.raises(InputError, match="covariance"):
         DriftFilter(DriftConfig(), TRUE, np.eye(3), STEP, 8.0)
+
+
+def by_filterpy(
+    x: np.ndarray, P: np.ndarray, h: np.ndarray, z: float, noise: float, k: np.ndarray, row: np.ndarray
+) -> None:
+    """`joseph` by filterpy."""
+    reference = KalmanFilter(dim_x=x.size, dim_z=1)
+    reference.x, reference.P = x[:, None].copy(), P.copy()
+    reference.update(np.array([[z]]), R=noise, H=h[None, :])
+    x[:] = reference.x[:, 0]
+    P[:] = 0.5 * (reference.P + reference.P.T)
+
+
+def test_the_compiled_filter_agrees_with_filterpy_through_changes_and_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, compiled = made(), made()
+    outcomes = set()
+    for k, row in enumerate(rows(900)):
+        truth = TRUE * (0.94 if k > 300 else 1.0)
+        target = float(row @ truth) + 1e-4 * np.sin(37.0 * k)
+        moving = not 600 <= k < 700
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                drift, "take_in", lambda x, P, h, e, v, noise, k, row, z=target: by_filterpy(x, P, h, z, noise, k, row)
+            )
+            outcome = reference.update(row, target, moving)
+        assert compiled.update(row, target, moving) == outcome
+        outcomes.add(outcome)
+    assert {"burst", "updated"} <= outcomes
+    np.testing.assert_allclose(reference.beta, compiled.beta, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(reference.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
 
 
 # --- The compiled algebra of the drift filter is that of filterpy's Kalman filter, step by step and over many of them.
@@ -203,6 +248,11 @@ def test_it_moves_no_faster_than_a_stage_creeps() -> None:
     assert moved_um == pytest.approx(-0.02 * 80.0, rel=1e-9), "one second at 2 % of the range"
 
 
+def test_nothing_moves_where_it_is_switched_off_or_before_anything_was_gained() -> None:
+    assert after(RestCreep(), 100, 1e-3, creep_s=0.0) == 0.0
+    assert after(RestCreep(), 100, 0.0) == 0.0
+
+
 def test_a_voltage_that_goes_on_holds_no_stage_in_place() -> None:
     stuck, still = RestCreep(), RestCreep()
     # 8 V in 4 s under a reading that does not change, and a hundredth of that.
@@ -210,6 +260,25 @@ def test_a_voltage_that_goes_on_holds_no_stage_in_place() -> None:
              for r, v in ((stuck, 4e-3), (still, 4e-5))]  # fmt: skip
     assert moved[0] == 0.0
     assert moved[1] < -0.5
+
+
+def test_a_new_rest_begins_from_the_constant_that_it_finds() -> None:
+    rest = RestCreep()
+    after(rest, 50, 1e-3)
+    rest.leave()
+    assert isnan(rest.constant_V)
+    assert [rest.shift_um(7.0, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(40)] == [0.0] * 40
+
+
+def test_its_state_goes_on_and_damage_is_named() -> None:
+    rest = RestCreep()
+    after(rest, 13, 1e-3)
+    again = load(RestCreep, save(rest))
+    one, other = ([r.shift_um(1.002, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(20)] for r in (rest, again))
+    assert one == other
+    assert sum(one) < 0.0
+    with pytest.raises(ModelFileError, match="u_V: got nothing"):
+        load(RestCreep, {"constant_V": 1.0, "steps": 3})
 
 
 def rested(model: LssvmInverse, config: LearnerConfig, hold_s: float) -> tuple[float, Learner]:

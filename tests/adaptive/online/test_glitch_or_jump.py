@@ -5,26 +5,31 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import fields, replace
+from typing import NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
 
 from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.dead_reckoning import Reckoning
 from dehyst.adaptive.online.gates import GLITCH, AdmissionConfig, EnvelopeConfig
 from dehyst.adaptive.online.glitch_or_jump import (
+    LEVEL_STD,
     NO_LEVEL,
     SIGMA,
+    USUAL_STD,
     WINDOWS,
     Circumstances,
-    HeldReadings,
+    Hold,
     Level,
     Verdict,
     judge,
     level_of,
 )
 from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample, StateDict
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
@@ -38,7 +43,7 @@ from dehyst.sim.stage.stage import Stage
 DT_S = 1e-3
 Recording = tuple[FloatArray, FloatArray]
 #: Instants at which something happens, in slow strokes and in fast ones.
-ATS = tuple(range(2000, 5000, 300))
+ATS = tuple(range(2000, 6500, 150))
 HELD = frozenset({"glitch", "ringing"})
 
 
@@ -47,26 +52,24 @@ HELD = frozenset({"glitch", "ringing"})
 RANGE_UM, PLACE_UM = 100.0, 40.0
 
 
-def circumstances(dt_s: float = DT_S) -> Circumstances:
+def circumstances(dt_s: float = DT_S, trusted: bool = True) -> Circumstances:
     """Those of a healthy axis with a range of 100 µm."""
     config = AdmissionConfig().at(dt_s)
     usual_um = config.surprise_share * RANGE_UM
     return Circumstances(
         config=config, envelope=EnvelopeConfig(), dt_s=dt_s, range_um=RANGE_UM,
         noise_um=usual_um / config.surprise_sigma, usual_um=usual_um, rest_um=0.0, low_um=-5.0,
-        high_um=105.0,
+        high_um=105.0, trusted=trusted,
     )  # fmt: skip
 
 
-def hold_at(model: LssvmInverse, place_um: float = PLACE_UM) -> HeldReadings:
+def hold_at(model: LssvmInverse, place_um: float = PLACE_UM) -> Hold:
     """A hold that begins at a place that was known."""
     none = np.zeros(0)
-    return HeldReadings(
-        Reckoning.begin(model, (place_um, 0.0, 0.0), 4.0, none, none, model.rest_memory(place_um)), place_um
-    )
+    return Hold(Reckoning.begin(model, (place_um, 0.0, 0.0), 4.0, none, none, model.rest_memory(place_um)), place_um)
 
 
-def put(hold: HeldReadings, old_um: float, y_um: float) -> None:
+def put(hold: Hold, old_um: float, y_um: float) -> None:
     """One sample, with the place that the reckoning is to have come to."""
     hold.u_V.append(4.0)
     hold.old_um.append(old_um)
@@ -107,7 +110,7 @@ class Mode:
         return self.size_um * math.exp(-self.damping * self.omega * t_s) * swing
 
 
-@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 1e-4])
+@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 5e-4, 1e-4])
 @pytest.mark.parametrize("modes", [1, 2])
 def test_looked_at_again_and_again_a_knock_is_no_jump(model: LssvmInverse, dt_s: float, modes: int) -> None:
     """None of 150 a sample rate, at swings of 0.5 to 5 % of the range, with a look at each reading."""
@@ -121,7 +124,7 @@ def test_looked_at_again_and_again_a_knock_is_no_jump(model: LssvmInverse, dt_s:
     assert said[Verdict.LOST] <= (0 if modes == 1 else 0.1 * said.total())
 
 
-@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 1e-4])
+@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 5e-4, 1e-4])
 @pytest.mark.parametrize("ringing", [0.0, 0.5, 1.0])
 def test_a_jump_is_found_by_its_level_and_soon(model: LssvmInverse, dt_s: float, ringing: float) -> None:
     """Plain ones always within 20 ms or 16 readings; ringing ones in 97 % or more, within 60 ms, to 0.1 of it."""
@@ -136,6 +139,22 @@ def test_a_jump_is_found_by_its_level_and_soon(model: LssvmInverse, dt_s: float,
     assert latest_s <= (0.06 if ringing else max(0.02, 17.0 * dt_s))
 
 
+def test_no_jump_claims_more_than_the_readings_have_moved(model: LssvmInverse) -> None:
+    """The reckoning goes 8 µm away at once, the readings stay: that is no jump of theirs."""
+    rng, now = np.random.default_rng(5), circumstances()
+    for moves_um, verdict in ((0.0, None), (8.0, Verdict.JUMP)):
+        hold = hold_at(model)
+        said = []
+        for _ in range(39):
+            # Where the readings themselves have moved by as much, the same distance is one.
+            put(hold, PLACE_UM - (8.0 - moves_um), PLACE_UM + moves_um + 0.5 * now.noise_um * rng.standard_normal())
+            said.append(judge(hold, now))
+            if said[-1] is Verdict.JUMP:
+                break
+        assert (said[-1] if verdict else None) is verdict
+        assert (Verdict.JUMP in said) == (verdict is not None)
+
+
 @pytest.mark.parametrize("share", [0.13, 0.2, -0.5])
 def test_no_jump_is_larger_than_the_envelope_allows(model: LssvmInverse, share: float) -> None:
     rng = np.random.default_rng(6)
@@ -144,6 +163,15 @@ def test_no_jump_is_larger_than_the_envelope_allows(model: LssvmInverse, share: 
     assert at_s <= 0.05
     inside = 0.9 * EnvelopeConfig().jump * RANGE_UM
     assert outcome(model, lambda _: math.copysign(inside, share), DT_S, rng)[0] is Verdict.JUMP
+
+
+def test_outside_the_identified_range_nothing_is_believed_at_once(model: LssvmInverse) -> None:
+    now, rng = circumstances(), np.random.default_rng(7)
+    for low_um, high_um in ((50.0, 105.0), (-5.0, 30.0)):
+        hold = hold_at(model)
+        for _ in range(39):
+            put(hold, PLACE_UM, PLACE_UM + 4.0 + 0.5 * now.noise_um * rng.standard_normal())
+            assert judge(hold, now._replace(low_um=low_um, high_um=high_um)) is Verdict.WAIT
 
 
 # ---- through the learner
@@ -219,9 +247,10 @@ def events(learner: Learner, before: StateDict | None = None) -> dict[str, int]:
 NOTHING = dict.fromkeys(("jumps", "jumps_undone", "trials", "restarts", "rollbacks", "distrusts"), 0)
 
 
+@pytest.mark.parametrize("share", [0.005, 0.015, 0.03])
 @pytest.mark.parametrize(
-    ("mode_Hz", "damping", "share"),
-    [(100.0, 0.03, 0.015), (100.0, 0.1, 0.03), (173.0, 0.01, 0.005), (291.0, 0.03, 0.03), (450.0, 0.01, 0.03)],
+    ("mode_Hz", "damping"),
+    [(100.0, 0.03), (100.0, 0.1), (173.0, 0.01), (291.0, 0.01), (291.0, 0.03), (450.0, 0.01), (450.0, 0.03)],
 )
 def test_a_knock_is_waited_for_and_teaches_nothing(
     model: LssvmInverse, recording: Recording, slow_states: dict[int, StateDict], mode_Hz: float, damping: float,
@@ -258,7 +287,7 @@ def test_a_knock_is_waited_for_and_teaches_nothing(
 def test_a_knock_at_any_time_leaves_the_model_as_it_was(
     model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, jumps: float, off: float
 ) -> None:
-    """Of 30 at random: at most that share is taken for a small jump, none has a name, and all answers stay.
+    """Of 100 at random: at most that share is taken for a small jump, none has a name, and all answers stay.
 
     The error of what is reckoned grows with the way gone: in strokes of up to 7.7 Hz some tenths of a percent of the
     range after 50 ms, and that is taken for a jump now and then.
@@ -269,7 +298,7 @@ def test_a_knock_at_any_time_leaves_the_model_as_it_was(
     twins = {at: Learner.from_state(state) for at, state in states.items()}
     for at, twin in twins.items():
         feed(twin, recording, at, at + 300)
-    for i in range(30):
+    for i in range(100):
         at = ATS[i % len(ATS)]
         damping = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))
         size_um = range_of(model) * rng.uniform(0.005, 0.03)
@@ -282,13 +311,14 @@ def test_a_knock_at_any_time_leaves_the_model_as_it_was(
         worst_V = max(worst_V, np.abs(answers(learner, twin.memory()) - answers(twin, twin.memory())).max())
         f, g = learner.features, twin.features
         moved_um = max(moved_um, *(abs((f.gain - g.gain) * y + f.offset_um - g.offset_um) for y in (10.0, 70.0)))
-    assert happened["jumps"] <= jumps * 30 + 1
+    assert happened["jumps"] <= jumps * 100
     assert happened["trials"] <= 1
     assert worst_V < off * model.span_V
     assert moved_um < 0.02 * range_of(model)
 
 
-@pytest.mark.parametrize(("gain", "ringing"), [(-0.12, 0.5), (-0.06, 1.0), (0.04, 0.5), (0.12, 1.0)])
+@pytest.mark.parametrize("ringing", [0.5, 1.0])
+@pytest.mark.parametrize("gain", [-0.12, -0.06, 0.04, 0.08, 0.12])
 @pytest.mark.parametrize("strokes", ["slow", "fast"])
 def test_a_gain_step_with_ringing_is_believed_once(
     model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, gain: float, ringing: float
@@ -298,7 +328,7 @@ def test_a_gain_step_with_ringing_is_believed_once(
     states = request.getfixturevalue(f"{strokes}_states")
     rng = np.random.default_rng(round(1e4 + 1e3 * gain + 10 * ringing))
     u, y = recording
-    for at in ATS[::3]:
+    for at in ATS[::5]:
         step_um = gain * y[at]
         if abs(step_um) < 0.008 * range_of(model):
             continue
@@ -327,14 +357,14 @@ def test_a_zero_step_with_ringing_is_found_and_kept(
     """Of 1 to 8 % of the range. It may be taken for a gain, and be put right by further jumps while it rings.
 
     After half a second the model is off by less than 0.4 % of the voltage span, in the median. Hardly any goes
-    on trial: at most two in 12 in slow strokes, four in fast ones that ring by the whole step.
+    on trial: at most one in 30 in slow strokes, one in 10 in fast ones that ring by the whole step.
     """
     recording = request.getfixturevalue("recording" if strokes == "slow" else "all_strokes")
     states = request.getfixturevalue(f"{strokes}_states")
     rng = np.random.default_rng([9, round(10 * ringing)])
     u, y = recording
     trials, off_pct = 0, []
-    for i in range(12):
+    for i in range(30):
         at = ATS[i % len(ATS)]
         step_um = rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.08) * range_of(model)
         damping, mode_Hz = math.exp(rng.uniform(math.log(0.02), math.log(0.1))), rng.uniform(150.0, 450.0)
@@ -348,10 +378,32 @@ def test_a_zero_step_with_ringing_is_found_and_kept(
         off_pct.append(learner.diagnostics()["recent_rms_error_pct"])
     assert np.median(off_pct) < 0.4
     assert max(off_pct) < 2.0
-    assert trials <= {"slow": 2, "fast": 4}[strokes] * (ringing > 0.0)
+    assert trials <= {"slow": 2, "fast": 8}[strokes] * (ringing > 0.0)
 
 
-@pytest.mark.parametrize("noise_share", [1e-9, 1e-5, 3e-4])
+def test_a_jump_of_a_fifth_is_not_believed_from_readings_at_one_level(model: LssvmInverse, still: Recording) -> None:
+    """As long as the stage rests it stays undecided; motion shows that the readings follow, and then it is."""
+    u, clean = still
+    shift_um = 0.2 * range_of(model)
+    y = clean.copy()
+    y[3500:] += shift_um
+    learner = Learner.from_model(model)
+    feed(learner, (u, y), 0, 3500)
+    frame, updates, before = learner.features, learner.parts.filter.state.updates, learner.state_dict()
+    feed(learner, (u, y), 3500, 5000)
+    assert events(learner, before)["jumps"] == 0
+    assert learner.features == frame
+    assert learner.parts.filter.state.updates == updates
+    said = feed(learner, (u, y), 5000, 6000)
+    assert events(learner, before)["jumps"] == 1
+    assert learner.trouble == ""
+    assert "learnt" in said[-100:]
+    for place in (20.0, 60.0):
+        shown_um = learner.features.offset_um + learner.features.gain * (place - frame.offset_um) / frame.gain
+        assert shown_um - place == pytest.approx(shift_um, abs=0.02 * range_of(model))
+
+
+@pytest.mark.parametrize("noise_share", [1e-9, 3e-6, 1e-5, 1e-4, 3e-4])
 @pytest.mark.parametrize("strokes", ["slow", "fast"])
 def test_a_sensor_that_sticks_with_noise_makes_no_jump(
     model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, noise_share: float
@@ -361,7 +413,7 @@ def test_a_sensor_that_sticks_with_noise_makes_no_jump(
     states = request.getfixturevalue(f"{strokes}_states")
     u, clean = recording
     rng = np.random.default_rng(2)
-    for at in ATS[::4]:
+    for at in ATS[::6]:
         y = clean.copy()
         y[at : at + 1000] = clean[at - 1] + noise_share * range_of(model) * rng.standard_normal(1000)
         learner = Learner.from_state(states[at])
@@ -371,11 +423,11 @@ def test_a_sensor_that_sticks_with_noise_makes_no_jump(
         assert learner.features == frame
 
 
-@pytest.mark.parametrize("at_ms", [1, 25])
+@pytest.mark.parametrize("at_ms", [1, 7, 25, 60])
 def test_state_goes_on_to_the_last_bit_while_it_rings(
     recording: Recording, slow_states: dict[int, StateDict], at_ms: int
 ) -> None:
-    at = ATS[5]
+    at = ATS[10]
     knocked = struck(recording, at, 220.0, 0.01, 2.0)
     one = Learner.from_state(slow_states[at])
     said = feed(one, knocked, at, at + at_ms)
@@ -387,7 +439,7 @@ def test_state_goes_on_to_the_last_bit_while_it_rings(
 def test_state_goes_on_to_the_last_bit_while_it_rings_about_a_new_level(
     recording: Recording, slow_states: dict[int, StateDict]
 ) -> None:
-    at = ATS[5]
+    at = ATS[10]
     u, y = struck(recording, at, 220.0, 0.01, 2.0)
     y[at:] += 3.0
     one = Learner.from_state(slow_states[at])
@@ -401,7 +453,7 @@ def test_state_goes_on_to_the_last_bit_while_it_rings_about_a_new_level(
 def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
     all_strokes: Recording, fast_states: dict[int, StateDict], kind: str
 ) -> None:
-    at = ATS[5]
+    at = ATS[10]
     u, y = all_strokes[0], all_strokes[1].copy()
     rng = np.random.default_rng(4)
     y[at : at + 600] = y[at] + 1e-4 * rng.standard_normal(600) if kind == "stuck" else y[1000:1600]
@@ -411,6 +463,21 @@ def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
     assert one.trouble
     assert one.parts.intake.holds
     assert_goes_on(one, (u, y), at + 400, at + 1500)
+
+
+def test_all_of_a_hold_is_in_its_state(model: LssvmInverse) -> None:
+    """Each of its fields with a value of its own."""
+    hold = hold_at(model)
+    for k in range(5):
+        put(hold, PLACE_UM + 0.1 * k, math.nan if k == 2 else PLACE_UM - 0.2 * k)
+    plain = [field for field in fields(Hold) if field.name not in ("reckoning", "u_V", "y_um", "old_um")]
+    values = {one.name: {int: 7 + i, float: 0.5 + i}[get_type_hints(Hold)[one.name]] for i, one in enumerate(plain)}
+    one = replace(hold, **values)
+    two = load(Hold, save(one))
+    for field in fields(Hold):
+        if field.name != "reckoning":
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(one.reckoning.numbers, two.reckoning.numbers)
 
 
 def assert_goes_on(one: Learner, recording: Recording, start: int, stop: int) -> None:
@@ -444,7 +511,8 @@ def before_glitch(model: LssvmInverse, recording: Recording) -> dict[str, object
     return learner.state_dict()
 
 
-@pytest.mark.parametrize(("count", "size_um"), [(1, -40.0), (2, 0.5), (5, 6.0), (PERSISTENCE, -2.0)])
+@pytest.mark.parametrize("count", [1, 2, 5, PERSISTENCE])
+@pytest.mark.parametrize("size_um", [0.5, -2.0, 6.0, -40.0])
 def test_a_run_of_wrong_readings_is_bridged(
     before_glitch: dict[str, object], recording: Recording, count: int, size_um: float
 ) -> None:
@@ -462,6 +530,23 @@ def test_a_run_of_wrong_readings_is_bridged(
     still = np.zeros(50)
     answers = [each.snapshot().feedforward(motion, still, still, twin.memory()).u_V for each in (learner, twin)]
     assert np.max(np.abs(answers[0] - answers[1])) < 5e-4 * learner.base.span_V
+    np.testing.assert_allclose(learner.memory(), twin.memory(), atol=0.05)
+
+
+def test_readings_that_are_none_are_bridged_by_their_voltages(
+    before_glitch: dict[str, object], recording: Recording
+) -> None:
+    """More of them in a row than a gap may be long: no new start, as the voltages are known."""
+    u, clean = recording
+    y = clean.copy()
+    y[AT : AT + 12] = math.nan
+    y[AT + 5] = 1e6
+    learner, twin = Learner.from_state(before_glitch), Learner.from_state(before_glitch)
+    restarts = learner.counters()["restarts"]
+    outcomes = feed_readings(learner, u, y, AT, AT + 60)
+    feed_readings(twin, u, clean, AT, AT + 60)
+    assert outcomes[:12] == ["not_finite"] * 5 + ["out_of_range"] + ["not_finite"] * 6
+    assert learner.counters()["restarts"] == restarts
     np.testing.assert_allclose(learner.memory(), twin.memory(), atol=0.05)
 
 
@@ -512,7 +597,32 @@ def test_a_glitch_longer_than_patience_is_a_jump_and_its_end_another_one_back(
     np.testing.assert_allclose(learner.memory(), twin.memory(), atol=0.1)
 
 
-@pytest.mark.parametrize("at", [3, PERSISTENCE + 4])
+def test_after_a_glitch_the_sensor_is_trusted_less(before_glitch: dict[str, object], recording: Recording) -> None:
+    """Where it has just been wrong, more readings are waited for before a jump is believed."""
+    u, clean = recording
+    y = clean.copy()
+    y[AT : AT + 3] += 5.0
+    y[AT + 100 :] += 2.0
+    learner = Learner.from_state(before_glitch)
+    patience = AdmissionConfig().doubt_persistence
+    feed_readings(learner, u, y, AT, AT + 100 + patience)
+    assert learner.counters()["jumps"] == 0
+    feed_readings(learner, u, y, AT + 100 + patience, AT + 101 + patience)
+    assert learner.counters()["jumps"] == 1
+
+
+def test_nothing_is_served_or_taught_while_undecided(before_glitch: dict[str, object], recording: Recording) -> None:
+    u, clean = recording
+    y = clean.copy()
+    y[AT:] *= 0.94
+    learner = Learner.from_state(before_glitch)
+    served, updates = learner.snapshot(), learner.parts.filter.state.updates
+    feed_readings(learner, u, y, AT, AT + PERSISTENCE)
+    assert learner.snapshot() is served
+    assert learner.parts.filter.state.updates == updates
+
+
+@pytest.mark.parametrize("at", [3, PERSISTENCE + 4, PERSISTENCE + 40])
 def test_state_goes_on_to_the_last_bit_while_held_and_on_probation(
     before_glitch: dict[str, object], recording: Recording, at: int
 ) -> None:
@@ -531,6 +641,16 @@ def test_state_goes_on_to_the_last_bit_while_held_and_on_probation(
     assert one.features == two.features
 
 
+def test_patience_is_configurable(model: LssvmInverse, recording: Recording) -> None:
+    u, y = recording[0], recording[1].copy()
+    y[AT:] += 2.0
+    learner = Learner.from_model(model, LearnerConfig(admission=AdmissionConfig(glitch_persistence=30)))
+    feed_readings(learner, u, y, 0, AT + 30)
+    assert learner.counters()["jumps"] == 0
+    feed_readings(learner, u, y, AT + 30, AT + 31)
+    assert learner.counters()["jumps"] == 1
+
+
 # --- The level under ringing: exact without noise, with stated error rates in noise; and how one thing follows another.
 #
 # The rates are those of one look at a fixed number of readings, by the rule of ``adaptive.online.glitch_or_jump``.
@@ -541,6 +661,7 @@ NOISE = 1.0
 USUAL = AdmissionConfig().surprise_sigma * NOISE
 #: Sizes of the windows that are looked at: those of the hypotheses, and the longest.
 SIZES = (*reversed(WINDOWS), 64)
+RATES_Hz = (500.0, 1000.0, 2000.0)
 
 
 class Rates(NamedTuple):
@@ -562,8 +683,8 @@ def ringing(
 
 
 def known(level: Level) -> bool:
-    """Whether the level is known to within what is usual."""
-    return SIGMA * level.std <= USUAL
+    """As ``hypotheses._known``: the deviation is small beside the level, or beside what is usual."""
+    return level.std <= max(LEVEL_STD * abs(level.at), USUAL_STD * USUAL)
 
 
 def decided(level: Level) -> bool:
@@ -571,7 +692,7 @@ def decided(level: Level) -> bool:
     return known(level) and abs(level.at) - USUAL > SIGMA * level.std
 
 
-def rates(step: float, amplitude: float, n: int, cases: int = 1000, modes: int = 1) -> Rates:
+def rates(step: float, amplitude: float, n: int, cases: int = 2000, modes: int = 1) -> Rates:
     """Of readings at a level ``step`` with modes from 5 to 45 % of the sample rate ringing on it, in noise."""
     rng = np.random.default_rng([n, int(amplitude), int(abs(step)), modes])
     hits = np.zeros(3)
@@ -590,8 +711,8 @@ def rates(step: float, amplitude: float, n: int, cases: int = 1000, modes: int =
 # ---- exact
 
 
-@pytest.mark.parametrize("value", [0.0, 1e6])
-@pytest.mark.parametrize("n", [6, 64])
+@pytest.mark.parametrize("value", [0.0, 0.3, -40.0, 1e6])
+@pytest.mark.parametrize("n", [6, 7, 16, 64])
 def test_the_level_of_a_constant_is_the_constant_and_knows_what_noise_leaves(value: float, n: int) -> None:
     level = level_of(np.full(n, value), 0.01)
     assert level.at == pytest.approx(value, rel=1e-9, abs=1e-9)
@@ -599,16 +720,24 @@ def test_the_level_of_a_constant_is_the_constant_and_knows_what_noise_leaves(val
     assert level.order == 0
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.02, 0.3])
-@pytest.mark.parametrize("n", [12, 64])
-def test_ringing_is_no_level_at_whatever_frequency_and_damping(damping: float, n: int) -> None:
+@pytest.mark.parametrize("rate_Hz", RATES_Hz)
+@pytest.mark.parametrize("damping", [0.0, 0.005, 0.02, 0.1, 0.3])
+@pytest.mark.parametrize("n", [12, 16, 28, 64])
+def test_ringing_is_no_level_at_whatever_frequency_and_damping(rate_Hz: float, damping: float, n: int) -> None:
     """A swing that is ten times as large as the level does not move it."""
-    for mode_Hz in np.linspace(0.05, 0.48, 12):
+    for mode_Hz in np.linspace(0.05, 0.48, 12) * rate_Hz:
         for phase in (0.0, 1.0, 2.0):
-            level = level_of(0.7 + ringing(n, 1.0, mode_Hz, damping, 7.0, phase), 1e-9)
+            level = level_of(0.7 + ringing(n, rate_Hz, mode_Hz, damping, 7.0, phase), 1e-9)
             assert level.at == pytest.approx(0.7, abs=1e-8)
             assert level.std < 1e-7
             assert level.order >= 2
+
+
+def test_two_modes_need_four_coefficients_and_are_no_level_either() -> None:
+    r = -2.0 + ringing(40, 1000.0, 140.0, 0.02, 5.0, 1.0) + ringing(40, 1000.0, 390.0, 0.01, 2.0, 2.0)
+    level = level_of(r, 1e-6)
+    assert level.at == pytest.approx(-2.0, abs=1e-5)
+    assert level.order == 4
 
 
 def test_what_goes_on_and_on_has_no_level() -> None:
@@ -634,6 +763,17 @@ def test_fewer_than_six_values_have_no_level() -> None:
     assert level_of(np.full(6, 3.0), 1.0).at == pytest.approx(3.0)
 
 
+def test_the_unit_of_the_readings_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    r = 20.0 + ringing(28, 1000.0, 220.0, 0.02, 30.0) + rng.standard_normal(28)
+    one = level_of(r, 1.0)
+    for unit in (1e-3, 20.0):
+        other = level_of(unit * r, unit)
+        assert other.order == one.order
+        told = (other.at, other.std, other.residual)
+        assert told == pytest.approx([unit * value for value in (one.at, one.std, one.residual)], rel=1e-4)
+
+
 def test_noise_makes_no_order_of_its_own_and_the_deviation_is_honest() -> None:
     """Readings at one level in noise: hardly ever coefficients of ringing, and as far off as is stated."""
     rng = np.random.default_rng(11)
@@ -645,7 +785,7 @@ def test_noise_makes_no_order_of_its_own_and_the_deviation_is_honest() -> None:
 
 
 @pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("amplitude", [5.0, 300.0])
+@pytest.mark.parametrize("amplitude", [5.0, 30.0, 300.0])
 def test_under_ringing_the_level_is_off_by_little_more_than_is_stated(amplitude: float, n: int) -> None:
     """Noise is in what the recursion goes by too: measured 1.2 to 1.5 stated deviations, beyond five in 0.9 %."""
     rng = np.random.default_rng([n, int(amplitude)])
@@ -663,20 +803,20 @@ def test_under_ringing_the_level_is_off_by_little_more_than_is_stated(amplitude:
 
 
 @pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("amplitude", [30.0, 300.0])
+@pytest.mark.parametrize("amplitude", [30.0, 100.0, 300.0])
 def test_a_knock_is_hardly_ever_another_level(amplitude: float, n: int) -> None:
     """Below 0.5 % of the cases, at swings of 0.5 to 5 % of the range; measured 0 of 2000 at all sizes."""
     got = rates(0.0, amplitude, n)
     assert got.decided < 0.005
-    assert got.known > (0.93 if n == min(SIZES) else 0.99)
+    assert got.known > 0.97
 
 
 @pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("amplitude", [30.0, 300.0])
+@pytest.mark.parametrize("amplitude", [30.0, 100.0, 300.0])
 @pytest.mark.parametrize("step", [60.0, -300.0])
 def test_a_step_is_found_under_its_ringing(step: float, amplitude: float, n: int) -> None:
-    """Within 0.1 of it, also where the swing is five times as large: in 93 % of the cases at 16 readings, then 99 %."""
-    assert rates(step, amplitude, n).found >= (0.93 if n == min(SIZES) else 0.99)
+    """Within 0.1 of it in at least 97 % of the cases, also where the swing is five times as large."""
+    assert rates(step, amplitude, n).found >= 0.97
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -686,3 +826,15 @@ def test_a_plain_step_is_found_always(step: float, n: int) -> None:
     got = rates(step, 0.0, n)
     assert got.found == got.decided
     assert got.found >= (0.999 if n == min(SIZES) and abs(step) < 2.5 * USUAL else 1.0)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_two_modes_are_hardly_ever_another_level(n: int) -> None:
+    """Fewer readings than four coefficients need do not know the level, and say so."""
+    assert rates(0.0, 100.0, n, modes=2).decided < 0.005
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_what_is_usual_is_no_level(n: int) -> None:
+    """A distance that is no surprise, in noise: nothing is ever decided."""
+    assert rates(0.9 * USUAL, 0.0, n).decided == 0.0

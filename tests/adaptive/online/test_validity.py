@@ -6,15 +6,17 @@ that nothing is rounded.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.learner import FALLBACK_RATIO, SHORT_S, Delay, Judgement
-from dehyst.adaptive.state import restore, save
+from dehyst.adaptive.online.learner import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement, Learner
+from dehyst.adaptive.state import load, restore, save
 
 ENTER_V, LEAVE_V = 0.25, 1.0
 BETWEEN_V = 0.5
@@ -35,10 +37,59 @@ def after(j: Judgement, error_V: float, enter_V: float = ENTER_V, leave_V: float
 # ---- validity
 
 
+@pytest.mark.parametrize("valid", [True, False])
+@pytest.mark.parametrize("error_V", [ENTER_V, BETWEEN_V, -BETWEEN_V, LEAVE_V])
+def test_between_the_thresholds_and_at_them_either_state_is_kept(valid: bool, error_V: float) -> None:
+    j = judgement(valid)
+    for _ in range(5):
+        assert after(j, error_V) is valid
+    assert j.valid is valid
+
+
 def test_it_is_left_above_the_one_and_entered_below_the_other() -> None:
     j = judgement()
     said = [after(j, error_V) for error_V in (0.75, 1.125, 0.75, 0.3125, 0.1875, 0.3125, 0.75, 1.125)]
     assert said == [True, False, False, False, True, True, True, False]
+
+
+def test_one_threshold_would_chatter_where_two_do_not() -> None:
+    """What the hysteresis is for: errors to and fro about a level change nothing; with one threshold, each time."""
+    errors_V = [BETWEEN_V * factor for factor in (0.875, 1.125) * 6]
+
+    def changes(enter_V: float, leave_V: float) -> int:
+        j, states = judgement(), [True]
+        states += [after(j, error_V, enter_V, leave_V) for error_V in errors_V]
+        return sum(a is not b for a, b in itertools.pairwise(states))
+
+    assert changes(ENTER_V, LEAVE_V) == 0
+    assert changes(BETWEEN_V, BETWEEN_V) == len(errors_V) - 1
+
+
+def test_a_single_error_does_not_decide_alone() -> None:
+    """One wild error among small ones, at the filter's rate: a fiftieth of its square enters the short term."""
+    j = judgement(rms_V=0.0)
+    j.take(2.0, 0.0, SHORT_S / 50.0)
+    assert j.short_V2 == pytest.approx(4.0 / 50.0, rel=1e-12)
+    assert j.decide(ENTER_V, LEAVE_V) is True
+
+
+@pytest.mark.parametrize("valid", [True, False])
+def test_the_learner_judges_by_both_of_its_thresholds(model: LssvmInverse, valid: bool) -> None:
+    """Shares of the voltage span; its defaults lie apart, and what lies between keeps either state."""
+    learner = Learner.from_model(model)
+    c, parts = learner.config, learner.parts
+    assert c.valid_leave >= 2.0 * c.valid_enter
+    said = []
+    for share in (math.sqrt(c.valid_enter * c.valid_leave), 1.02 * c.valid_enter, 0.98 * c.valid_leave):
+        error_V = share * model.span_V
+        parts.judgement.valid, parts.judgement.short_V2 = valid, error_V**2
+        parts.judge(error_V, error_V)
+        said.append(learner.parts.judgement.valid)
+    assert said == [valid] * 3
+    for share, wanted in ((0.98 * c.valid_enter, True), (1.02 * c.valid_leave, False)):
+        parts.judgement.valid, parts.judgement.short_V2 = not wanted, (share * model.span_V) ** 2
+        parts.judge(share * model.span_V, share * model.span_V)
+        assert parts.judgement.valid is wanted
 
 
 def test_thresholds_that_lie_the_wrong_way_round_are_refused() -> None:
@@ -74,6 +125,31 @@ def test_how_long_it_has_fallen_back_is_counted_from_the_last_time() -> None:
 # ---- what an error changes
 
 
+def test_means_follow_with_their_time_constants_and_doubt_fades() -> None:
+    j = Judgement(1.0, 2.0, 3.0, 4.0, doubt_V2=8.0)
+    step_s = 0.05
+    j.take(0.5, 2.0, step_s)
+    assert j.error_V == 0.5
+    assert j.judged == 1
+    assert j.long_V2 == pytest.approx(1.0 + (0.25 - 1.0) * step_s / LONG_S, rel=1e-15)
+    assert j.short_V2 == pytest.approx(2.0 + (0.25 - 2.0) * step_s / SHORT_S, rel=1e-15)
+    assert j.frozen_V2 == pytest.approx(3.0 + (4.0 - 3.0) * step_s / LONG_S, rel=1e-15)
+    assert j.frozen_short_V2 == 4.0
+    assert j.doubt_V2 == pytest.approx(8.0 * (1.0 - step_s / SHORT_S), rel=1e-15)
+
+
+def test_a_step_longer_than_the_time_constants_is_taken_whole_and_no_more() -> None:
+    j = judgement()
+    j.doubt_V2 = 1.0
+    j.take(2.0, 4.0, 10.0)
+    assert (j.long_V2, j.short_V2, j.frozen_V2, j.frozen_short_V2, j.doubt_V2) == (4.0, 4.0, 16.0, 16.0, 0.0)
+
+
+def test_the_stated_variance_is_the_worse_of_both_terms_and_doubt() -> None:
+    assert Judgement(4.0, 1.0, 0.0, 0.0, doubt_V2=0.5).variance_V2 == 4.5
+    assert Judgement(1.0, 4.0, 0.0, 0.0, doubt_V2=0.5).variance_V2 == 4.5
+
+
 def test_inside_counts_by_what_was_stated_before_the_error_was_known() -> None:
     j = judgement(rms_V=1.0)
     told = []
@@ -82,6 +158,11 @@ def test_inside_counts_by_what_was_stated_before_the_error_was_known() -> None:
         told.append(j.inside)
     # Of the first nothing had been stated; the third is outside, and for it the fourth is within what is stated then.
     assert told == [0, 1, 1, 2]
+
+
+def test_a_state_comes_back_whole() -> None:
+    j = Judgement(1.0, 2.0, 3.0, 4.0, 0.5, 7, 3, False, True, 0.25, 0.125)
+    assert load(Judgement, save(j)) == j
 
 
 # ---- the model as it was
