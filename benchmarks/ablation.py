@@ -581,11 +581,6 @@ def _begin_anew(self: Intake, sample: Sample, _hold: Any) -> Any:
     return self._restart(sample, gates.SETTLING)
 
 
-def _never_alone(self: Parts) -> bool:
-    self.alone = False
-    return False
-
-
 def _no_kernel(self: ResidualWindow) -> tuple[FloatArray, FloatArray, float]:
     support, alpha, _ = _ARRAYS(self)
     return support, np.zeros_like(alpha), 0.0
@@ -649,7 +644,6 @@ RULES: Final = (
     Rule("the noise follows from the innovations", ((drift, "update", _of_fixed_noise),)),
     Rule("the window learns at moving phases", ((learner, "due", _fixed_phase),)),
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
-    Rule("identified model during a trial", ((Parts, "watch_trial", _never_alone),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
     Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
 )  # fmt: skip
