@@ -183,10 +183,10 @@ def ringing_peak(left_um: FloatArray, described_um: FloatArray, mask: BoolArray,
     left, described = (np.where(mask, x - x.mean(), 0.0) for x in (left_um, described_um))
     powers = [np.square(np.abs(np.fft.rfft(x * np.hanning(n)))) for x in (left, described)]
     best, at_hz = _RINGS, 0.0
-    for f_hz in np.geomspace(125.0 / (n * dt_s), 0.47 / dt_s, 400):
+    for f_hz in np.geomspace(125.0, 0.47 * n, 400) / (n * dt_s) if n > 300 else ():
         off = np.abs(f / f_hz - 1.0)
         inside, beside = off < 0.02, (off > 0.06) & (off < 0.3)
-        ratio, driven = (float(np.median(np.sort(p[inside])[:-3]) / np.median(p[beside])) for p in powers)
+        ratio, driven = (float(np.median(np.sort(p[inside])[:-3]) / max(np.median(p[beside]), 1e-300)) for p in powers)
         if ratio > best * max(driven, 1.0):
             best, at_hz = ratio / max(driven, 1.0), float(f_hz)
     band = np.abs(f / max(at_hz, 1e-9) - 1.0) < 0.06

@@ -354,7 +354,7 @@ class Search:
         told = np.any([gradient != 0.0 for _, gradient in numbers], axis=0)
         ends = [v != s.neutral and not s.low < v < s.high and not s.linear for s, v in zip(parameters, q, strict=True)]
         # A reported number at its bound is none that was found. Of the many of a free form a few may be.
-        if 2 * np.sum(told & ends) >= np.sum(told) or not self.plausible(best):
+        if 2 * np.sum(told & ends) >= max(1, np.sum(told)) or not self.plausible(best):
             return False
         now, after = held.per_block_um2, best.held.per_block_um2
         share = self.share(gain, held)

@@ -94,7 +94,7 @@ def test_readings_at_a_limit_are_told_from_those_on_a_coarse_grid_and_from_rests
     assert reading_limits(resting) == (-np.inf, np.inf)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [4, 5])
 def test_a_mode_rings_in_what_the_loop_leaves_and_hum_does_not(seed: int) -> None:
     data, truth = injected("resonance", seed)
     mask = np.ones(N, dtype=np.bool_)
