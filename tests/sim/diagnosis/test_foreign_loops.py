@@ -126,9 +126,7 @@ def test_a_payload_that_was_there_before_is_seen_against_the_stage_file_through_
     assert abs(found.level().f_hz * np.sqrt(1.0 + own["ratio"]) / own["known_Hz"] - 1.0) < 0.002
     # The stage of this file has no lag of its own: the first one is the sensor's.
     assert second_lag(readings).seen is True
-    unloaded = replace(
-        LOADED_AND_LAGGING, effects=LOADED_AND_LAGGING.effects | {"payload_change": own | {"ratio": 0.0}}
-    )
+    unloaded = LOADED_AND_LAGGING.effects | {"payload_change": own | {"ratio": 0.0}}
     assert payload_seen(readings_of(replace(LOADED_AND_LAGGING, effects=unloaded))).seen is False
 
 
