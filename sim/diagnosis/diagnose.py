@@ -33,6 +33,7 @@ from dehyst.sim.readings.noise import (
     converter_grid,
     is_noise,
     noise_floor,
+    reading_limits,
     recording_defects,
     repeated_readings,
 )
@@ -69,11 +70,13 @@ class Options:
 
 
 def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_wen") -> BoolArray:
-    """The mask without the first samples, which depend on what the stage did before the recording.
+    """The mask without readings at a limit of the sensor, beyond which nothing is known, and without the first samples,
+    which depend on what the stage did before the recording.
 
     Raises InputError if fewer than 200 samples remain.
     """
-    out = mask.copy()
+    low_um, high_um = reading_limits(data)
+    out = mask & (data.y_um > low_um) & (data.y_um < high_um)
     if not data.begins_at_rest and nominal == "bouc_wen":
         out[:1] = False  # The start is fitted here, and it determines the lags.
         return out
@@ -167,8 +170,7 @@ def diagnose(
     nominal = with_other_axis(nominal, mask)
     data = nominal.model.data
     doubles = repeated_readings(data.y_um, floor.sigma_um, grid.step_um)
-    doubled = doubles.count >= 5 and doubles.probability > 2e-4
-    if doubled:
+    if doubles.count >= 5 and doubles.probability > 2e-4:
         mask = mask.copy()
         mask[doubles.where.astype(np.int64)] = False
         nominal = calibrate(nominal.model, nominal.p, mask, 4, 1e-4)
@@ -196,7 +198,7 @@ def diagnose(
     extended, held = search.fitted_again(extended, held)
     n = int(mask.sum())
     causes = named(search, extended, held, found)
-    causes += in_readings(options.catalogue, grid, coarse, floor, extended, n)
+    causes += in_readings(options.catalogue, extended, mask, floor)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     progress("fitting a black box", 0.92)
     on_test: tuple[ModelFit, ModelFit] | None = None
@@ -248,8 +250,8 @@ def diagnose(
         taught_um=taught_um,
         explained=explained,
         defects=recording_defects(doubles, floor.sigma_um, grid.step_um, dropped, data.n),
-        left=(*where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um), *changing(search)),
-        unsteady=tuple(cause.name for cause in search.unsteady),
+        left=where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um),
+        uncertain=tuple(sorted(search.uncertain)),
         on_test=on_test,
         catalogue=options.catalogue,
     )
@@ -318,19 +320,6 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
     return tuple(causes)
 
 
-def changing(search: Search) -> tuple[str, ...]:
-    """Sentences on the causes whose size changes from stretch to stretch."""
-    out = []
-    for cause in search.unsteady:
-        names = " or ".join(sorted(search.catalogue.same_set({cause.name}))).replace("_", " ")
-        low, high = np.quantile(cause.stretches.sizes, (0.1, 0.9))
-        out.append(
-            f"stretches: {names} would remove {100 * cause.share:.0f} % of it, but has {low:.2g} to {high:.2g} of its "
-            f"size in single stretches of the record: it is another error that looks like it"
-        )
-    return tuple(out)
-
-
 #: The error of a start is this many times that of any later block.
 _BEYOND = 1.5
 #: Share of the explainable squared error from which named causes explain a recording, or a part of it.
@@ -386,15 +375,13 @@ def not_excited(search: Search, floor: NoiseFloor) -> tuple[str, ...]:
     return tuple(name for name, cause in search.catalogue.causes.items() if cause.forms and name not in seen)
 
 
-def in_readings(
-    catalogue: Catalogue, grid: ConverterGrid, coarse: bool, floor: NoiseFloor, extended: ModelFit, n: int
-) -> tuple[NamedCause, ...]:
-    """The causes that the readings show without a fit, such as a coarse grid. ``n``: number of samples that count."""
+def in_readings(catalogue: Catalogue, extended: ModelFit, mask: BoolArray, floor: NoiseFloor) -> tuple[NamedCause, ...]:
+    """The causes that the readings show without a fit, such as a coarse grid, and that no fit has found."""
     flat, out = extended.residual_um, list[NamedCause]()
     for name, cause in catalogue.causes.items():
-        if cause.in_readings is None:
+        if cause.in_readings is None or any(name == fitted.name for fitted in extended.model.causes):
             continue
-        found = cause.in_readings.find(grid, coarse, floor.sigma_um, extended.sse_um2 / n)
+        found = cause.in_readings.find(extended.model.data, flat, mask, floor.sigma_um)
         if found is not None:
             sight = Sight(True, found.words)
             out.append(

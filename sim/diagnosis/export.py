@@ -96,7 +96,7 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
         if mine.refit:
             loose |= {e.label for e in added}
     extras, extras_um2 = list[Effect](), 0.0
-    for c in diagnosis.causes:
+    for c in (c for c in diagnosis.causes if c.index < 0):
         without_fit = diagnosis.catalogue.causes[c.name].in_readings
         if without_fit is not None:
             more, noise_um2 = without_fit.effects(c.parameters)

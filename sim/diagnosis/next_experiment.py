@@ -139,12 +139,12 @@ def _excite(missing: list[CauseModel], fit: ModelFit, sigma_um: float) -> str | 
     wanted = [f for f in missing if f.shown_by_a_drive]
     best: tuple[str, list[str]] = ("", [])
     for experiment in experiments(fit.model.data):
-        base = _at(fit.model, fit.p, experiment)
+        base, data = _at(fit.model, fit.p, experiment), fit.model.data
+        there = replace(data, u_V=experiment.u_V, scales_from=data.scales)
         names: list[str] = []
         for cause in wanted:
-            data = fit.model.data
             crossing = cause.of_other_axis and bool(np.any(experiment.u2_V))
-            if cause.missing(data) and not crossing:
+            if cause.missing(there) and not crossing:
                 continue
             model = fit.model.with_cause(cause)
             for trial in cause.guesses(data, fit.residual_um)[:3]:

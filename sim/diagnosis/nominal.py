@@ -29,7 +29,7 @@ def common_parameters(data: FitData) -> tuple[ModelParameter, ModelParameter]:
 
 
 @dataclass(frozen=True)
-class BoucWenStage:
+class BoucWenStage(NominalStage):
     """The chapter's stage, (2.1) and (2.2) with n = 1. A recording (u, y) determines alpha, beta, gamma, d and b/k.
 
     With sqrt(k/m) = 3.55e4 rad/s the mass of Table 2.1 adds a pole 0.3 µs from the origin, which no recording
@@ -37,21 +37,7 @@ class BoucWenStage:
     this stage but something that it lacks.
     """
 
-    hold: str = "zero"
     name: str = "bouc_wen"
-    #: The hysteresis at the first sample is a parameter, because the recording does not begin at rest at 0 V.
-    free_memory: bool = False
-
-    def with_other_hold(self) -> BoucWenStage:
-        return replace(self, hold="zero" if self.hold == "first" else "first")
-
-    def with_free_memory(self) -> BoucWenStage:
-        return self if self.free_memory else replace(self, free_memory=True)
-
-    @property
-    def substeps(self) -> int:
-        # h is curved while the voltage runs linearly between samples; under a held voltage one exact step suffices.
-        return 4 if self.hold == "first" else 1
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         g = max(abs(data.gain_um_per_V), 1e-9)
@@ -97,9 +83,6 @@ class BoucWenStage:
     def dynamics(self, p: FloatArray, data: FitData) -> Dynamics:
         return Dynamics((float(p[4]),), (), float(p[6]) * data.dt_s, self.hold)
 
-    def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
-        return x_um
-
     def offset_um(self, p: FloatArray) -> float:
         return float(p[5])
 
@@ -108,17 +91,14 @@ class BoucWenStage:
 
 
 @dataclass(frozen=True)
-class LinearStage:
+class LinearStage(NominalStage):
     """A linear stage: gain and one mode, or two lags if overdamped."""
 
-    hold: str = "zero"
     name: str = "linear"
 
-    def with_other_hold(self) -> LinearStage:
-        return replace(self, hold="zero" if self.hold == "first" else "first")
-
-    def with_free_memory(self) -> LinearStage:
-        return self
+    @property
+    def remembers(self) -> bool:
+        return False
 
     @property
     def substeps(self) -> int:
@@ -172,14 +152,8 @@ class LinearStage:
         mode = (float(np.exp(p[1])), float(np.exp(p[2])))
         return Dynamics((), (mode,), float(p[4]) * data.dt_s, self.hold)
 
-    def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
-        return x_um
-
     def offset_um(self, p: FloatArray) -> float:
         return float(p[3])
-
-    def start_um(self, p: FloatArray) -> float:
-        return 0.0
 
 
 #: Relative spread of the mode frequencies of one type of stage; a larger difference is a payload.
@@ -189,7 +163,7 @@ SCALE = 2.0
 
 
 @dataclass(frozen=True)
-class FileStage:
+class FileStage(NominalStage):
     """The stage of a stage file, in three blocks: effects before the mechanics, modes, and effects behind them.
 
     Numbers of the actuator that are not zero are calibrated as factors of the file's, between 1/2 and 2; the
@@ -197,28 +171,19 @@ class FileStage:
     and changes during a run are left out.
     """
 
-    before: Chain
-    modes_hz: tuple[tuple[float, float], ...]
-    behind: Chain
-    calibrated: tuple[str, ...]
-    hold: str = "zero"
     name: str = "stage"
-    #: Where the stage came from before the first sample is a parameter.
-    free_memory: bool = False
+    before: Chain = field(default_factory=Chain)
+    modes_hz: tuple[tuple[float, float], ...] = ()
+    behind: Chain = field(default_factory=Chain)
+    calibrated: tuple[str, ...] = ()
     _unit: Chain = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_unit", Chain((effect("linear_actuator", gain_um_per_V=1.0), *self.behind)))
 
-    def with_other_hold(self) -> FileStage:
-        return replace(self, hold="zero" if self.hold == "first" else "first")
-
-    def with_free_memory(self) -> FileStage:
-        return replace(self, free_memory=True) if self.has_loop and not self.free_memory else self
-
     @property
-    def substeps(self) -> int:
-        return 4 if self.hold == "first" else 1
+    def remembers(self) -> bool:
+        return self.has_loop
 
     @property
     def has_loop(self) -> bool:
@@ -319,9 +284,6 @@ class FileStage:
     def offset_um(self, p: FloatArray) -> float:
         return float(p[self._offset])
 
-    def start_um(self, p: FloatArray) -> float:
-        return 0.0
-
 
 def _range(chain: Chain, path: str) -> tuple[float, float]:
     label, _, name = path.rpartition(".")
@@ -363,7 +325,9 @@ def file_stage(config: StageConfig) -> FileStage:
             f"stage {config.name!r}: got no actuator among its effects, expected bouc_wen, linear_actuator or "
             "generalised_play: a stage without one does not move"
         )
-    return FileStage(Chain(tuple(before)), tuple(modes), Chain(tuple(behind)), tuple(loose))
+    return FileStage(
+        before=Chain(tuple(before)), modes_hz=tuple(modes), behind=Chain(tuple(behind)), calibrated=tuple(loose)
+    )
 
 
 # Calibration of the nominal stage, before a cause is looked for.

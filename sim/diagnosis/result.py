@@ -67,8 +67,8 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     #: Causes that the search accepted although together they do not explain the recording (verdict "unexplained").
     partial: tuple[str, ...] = ()
-    #: Causes whose size changes from stretch to stretch; the sentences in ``left`` say by how much.
-    unsteady: tuple[str, ...] = ()
+    #: Causes that the search dropped because all their numbers may be zero.
+    uncertain: tuple[str, ...] = ()
     #: Source of the held-out errors: `FOLDS` or `TEST`.
     heldout_source: str = FOLDS
     #: Held-out error of a black box, and the share of what is explainable that the named causes explain.
@@ -128,7 +128,7 @@ class Diagnosis:
         }
         out["defects"] = [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects]
         out["left"] = list(self.left)
-        out["tried_not_named"] = [*self.partial, *self.unsteady]
+        out["tried_not_named"] = [*self.partial, *self.uncertain]
         return out
 
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
 from dehyst.sim.effects.holds import first_order
-from dehyst.sim.effects.sampled_lags import agrees, apart, is_of_the_recorder, second_lag
-from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.effects.sampled_lags import FurtherLag, second_lag
+from dehyst.sim.fitting.fit_data import ActsOn, FitData
 from dehyst.sim.fitting.lags import lag_ends
-from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
-
-if TYPE_CHECKING:
-    from dehyst.sim.readings.readings import Readings
 
 # Its step in the simulation.
 
@@ -44,39 +40,16 @@ def hold_of_later_effects(values: Mapping[str, float], context: Context) -> Cont
 
 
 @dataclass(frozen=True)
-class AmplifierLag(CauseModel):
-    """First-order lag of the voltage before the hysteresis, 30 µs (5 kHz) to 30 ms."""
+class AmplifierLag(FurtherLag):
+    """First-order lag of the voltage before the hysteresis."""
 
-    test_answers_to_others: bool = True
-    unseen_is_absent: bool = True
-    fast: bool = True
+    at: ActsOn = ActsOn.DRIVE
     substeps: int = 4
     continuous: bool = True
-
-    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        return (ModelParameter("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * data.dt_s), ActsOn.DRIVE),)
-
-    def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return not is_of_the_recorder(float(p[0]), data)
-
-    def agreement(self, p: FloatArray, readings: Readings) -> str:
-        return agrees(float(p[0]), readings)
-
-    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        return apart(nominal, names)
-
-    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        dt = data.dt_s
-        return single_guesses([0.1 * dt, 0.3 * dt, dt, 4.0 * dt, 12.0 * dt])
 
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         ratio = p[0] / data.dt_s
         return lag_ends(u_V, max(ratio, 1e-3), data.straight)
-
-
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((AMPLIFIER_LAG.clipped(tau_s=v["tau_s"]),))
 
 
 AMPLIFIER_LAG = Kind(
@@ -95,7 +68,7 @@ AMPLIFIER_LAG = Kind(
         sign="a lag beside the stage's own in phase and gain of the response, with what happens within a sample",
         forms=(AmplifierLag(),),
         tests=(second_lag,),
-        in_library=in_library,
+        in_library=same_numbers("amplifier_lag", tau_s="tau_s"),
         picture=pictures.after_steps,
     ),
 )

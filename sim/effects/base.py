@@ -21,14 +21,13 @@ import numpy as np
 from numba import types
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim.fitting.fit_data import FitData
 from dehyst.sim.fitting.stage_model import CauseModel
 from dehyst.sim.pictures import Draw, over_time
 from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from dehyst.sim.readings.noise import ConverterGrid
     from dehyst.sim.readings.readings import Readings
 
 _types: Any = types
@@ -171,18 +170,29 @@ class FoundInReadings:
 
 @dataclass(frozen=True)
 class InReadings:
-    """An effect that no form is fitted for.
+    """What the readings show of an effect without a fit.
 
-    ``find``: (grid of the readings, whether it is far coarser than the noise, noise floor in µm, mean squared error in
-    µm² that is left). ``effects``: its numbers as effects of the library, and their part of the noise, µm².
+    ``find``: (recording; residual of the model with all causes, µm, and samples that count, (n,) each; noise floor,
+    µm). ``effects``: its numbers as effects of the library, and their part of the noise, µm².
     """
 
-    find: Callable[[ConverterGrid, bool, float, float], FoundInReadings | None]
+    find: Callable[[FitData, FloatArray, BoolArray, float], FoundInReadings | None]
     effects: Callable[[dict[str, float]], tuple[tuple[Effect, ...], float]]
 
 
 def _not_in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
     return None
+
+
+def same_numbers(name: str, refit: bool = False, **numbers: str) -> Callable[..., InLibrary]:
+    """What becomes of a form whose reported ``numbers`` are those of the effect ``name``, by its parameters."""
+
+    def made(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary:
+        found = form.reported(p, data)
+        values = {parameter: found[number][0] for parameter, number in numbers.items()}
+        return InLibrary((_kind_named(name).clipped("", **values),), refit)
+
+    return made
 
 
 @dataclass(frozen=True)
@@ -197,7 +207,7 @@ class Cause:
     in_library : (form, fitted parameters, data) -> effects of the library; None where the library has no equal.
     picture : draws it.
     same_as : causes that one voltage and one sensor cannot tell from it; either side may say so.
-    in_readings : for an effect that is found without a fit.
+    in_readings : what of it is found without a fit.
     """
 
     sign: str = ""

@@ -15,7 +15,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
 from dehyst.sim.effects.holds import first_order
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, LastResultCache, ModelParameter
 from dehyst.sim.fitting.lags import slow_poles
@@ -125,11 +125,6 @@ def _steps(data: FitData, taus_s: FloatArray) -> FloatArray:
     return data.derived(("step responses", taus_s.size), lambda: 1.0 - np.exp(-data.t_s[None, :] / taus_s[:, None]))
 
 
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((CREEP.clipped(gain_per_decade=v["gain_per_decade"]),), refit=True)
-
-
 # Its signature in the readings.
 
 
@@ -173,7 +168,7 @@ CREEP = Kind(
         "of equal cycles does",
         forms=(Creep(),),
         tests=(in_rests, in_cycles),
-        in_library=in_library,
+        in_library=same_numbers("creep", refit=True, gain_per_decade="gain_per_decade"),
         picture=pictures.over_log_time,
     ),
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
 from dehyst.sim.effects.sampled_lags import lags_of_response
 from dehyst.sim.fitting.dynamics import Dynamics
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
@@ -65,7 +65,7 @@ class Delay(CauseModel):
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt = data.dt_s
-        return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 6.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
+        return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 20.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
 
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A voltage that runs straight to the next sample in place of being held moves it by so much.
@@ -76,11 +76,6 @@ class Delay(CauseModel):
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return replace(system, delay_s=float(p[0]))
-
-
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((DELAY.clipped(delay_s=v["tau_s"]),))
 
 
 # Its signature in the readings.
@@ -109,7 +104,7 @@ DELAY = Kind(
         sign="a straight part of the phase over frequency, beyond a sample",
         forms=(Delay(),),
         tests=(seen,),
-        in_library=in_library,
+        in_library=same_numbers("delay", delay_s="tau_s"),
         picture=pictures.after_steps,
     ),
 )

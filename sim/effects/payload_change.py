@@ -15,7 +15,7 @@ import numpy as np
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
+from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, same_numbers
 from dehyst.sim.fitting.dynamics import Dynamics, first_ringing
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from dehyst.sim.fitting.stage_model import CauseModel, Guess
@@ -123,11 +123,6 @@ class PayloadChange(CauseModel):
         return None if other.modes_hz == system.modes_hz else (float(p[1]), other)
 
 
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((PAYLOAD_CHANGE.clipped(payload_ratio=v["payload_ratio"]),))
-
-
 # Its signature in the readings.
 
 
@@ -175,7 +170,7 @@ PAYLOAD_CHANGE = Kind(
         sign="the stage rings at another frequency than the known mode, or at another one from some moment on",
         tests=(seen,),
         forms=(PayloadChange(), PayloadChange(variant="midway", pins=())),
-        in_library=in_library,
+        in_library=same_numbers("payload_change", payload_ratio="payload_ratio"),
         picture=pictures.frequency_response,
     ),
 )

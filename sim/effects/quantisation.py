@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
 from dehyst.sim.effects.base import Cause, Effect, FoundInReadings, InReadings, Kind, Parameter, Place, block
-
-if TYPE_CHECKING:
-    from dehyst.sim.readings.noise import ConverterGrid
+from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.readings.noise import converter_grid
 
 
 @block
@@ -19,13 +21,14 @@ def run_quantisation(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) ->
             x[k] = p[0] * round(x[k] / p[0])
 
 
-def find(grid: ConverterGrid, coarse: bool, sigma_um: float, left_um2: float) -> FoundInReadings | None:
-    """A grid that is far coarser than the noise (``coarse``), or makes a fifth of what is left above it."""
-    if grid.step_um <= 0.0:
+def find(data: FitData, residual_um: FloatArray, mask: BoolArray, sigma_um: float) -> FoundInReadings | None:
+    """A grid that is coarser than the noise and makes a fifth of what is left."""
+    grid = converter_grid(data.y_um[mask])
+    if grid.step_um <= 1.2 * sigma_um:
         return None
     own = grid.step_um**2 / 12.0
-    share = own / max(left_um2, own)
-    if not coarse and (grid.step_um <= 1.2 * sigma_um or share <= 0.2):
+    share = own / max(float(np.mean(np.square(residual_um[mask]))), own)
+    if share <= 0.2 and grid.step_um <= 2.0 * sigma_um:
         return None
     step, rounding = grid.step_um, 1e-3 * grid.step_um
     words = f"all readings lie on a grid of {1e3 * step:.4g} nm ({grid.levels} levels)"

@@ -86,6 +86,11 @@ class RateDependence(CauseModel):
     rate_lag_s: float = 0.004
     free_rate_lag: bool = False
 
+    def missing(self, data: FitData) -> str:
+        # At one period the rate goes with the height, in strokes of one rate with nothing.
+        spans = (float(np.ptp(np.log(x))) if x.size else 0.0 for x in data.strokes)
+        return "" if min(spans) >= np.log(3.0) else "strokes of two durations and rates, a factor of three apart"
+
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         return 0.003 <= self.reported(p, data)["growth_per_decade"][0] <= 0.6
 

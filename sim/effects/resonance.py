@@ -9,9 +9,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
+from dehyst.sim.effects.base import (
+    Cause,
+    Context,
+    Effect,
+    FoundInReadings,
+    InReadings,
+    Kind,
+    Parameter,
+    Place,
+    same_numbers,
+)
 from dehyst.sim.effects.holds import second_order
 from dehyst.sim.effects.mechanics import run_mode
 from dehyst.sim.fitting.dynamics import Dynamics
@@ -48,6 +58,8 @@ class Resonance(CauseModel):
 
     unseen_is_absent: bool = True
     fast: bool = True
+    #: Frequency at which the readings ring; 0 where they do not.
+    peak_hz: float = 0.0
 
     def also(self, data: FitData) -> tuple[str, ...]:
         return _or_a_payload(data)
@@ -87,7 +99,8 @@ class Resonance(CauseModel):
         if not np.any(inside):
             return []
         peak = float(f[inside][np.argmax(power[inside])])
-        guesses = {peak * r for r in (0.97, 0.985, 0.995, 1.0, 1.005, 1.015, 1.03)}
+        near = (0.97, 0.985, 0.995, 1.0, 1.005, 1.015, 1.03)
+        guesses = {f_hz * r for r in near for f_hz in (peak, self.peak_hz or peak)}
         guesses |= {
             v for v in (150.0, 250.0, 350.0, 450.0, 600.0) if np.exp(parameters[0].low) < v < np.exp(parameters[0].high)
         }
@@ -96,6 +109,9 @@ class Resonance(CauseModel):
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         mode = (float(np.exp(p[0])), float(np.exp(p[1])))
         return replace(system, modes_hz=(*system.modes_hz, mode))
+
+    def shown(self, readings: Readings) -> CauseModel:
+        return replace(self, peak_hz=readings.once(_ringing_hz))
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         f, z = float(np.exp(p[0])), float(np.exp(p[1]))
@@ -113,13 +129,10 @@ class StructureModes(Modes):
         return _or_a_payload(data)
 
 
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    # Of parallel modes the strongest becomes one in series.
-    return InLibrary((RESONANCE.clipped(frequency_Hz=v["f0_hz"], damping_ratio=v["damping"]),))
-
-
 # Its signature in the readings.
+
+#: Power of a band in that of its neighbours from which on a mode rings there.
+_RINGS = 10.0
 
 
 def seen(readings: Readings) -> Sight:
@@ -158,6 +171,61 @@ def seen(readings: Readings) -> Sight:
     return Sight(False, f"no peak in the response from {f[0]:.2g} to {f[-1]:.3g} Hz")
 
 
+def ringing_peak(left_um: FloatArray, described_um: FloatArray, mask: BoolArray, dt_s: float) -> tuple[float, float]:
+    """Frequency (Hz) of the largest peak above its neighbours in the spectrum of ``left_um`` (n,), and its share of the
+    power. Zeros where there is none.
+
+    A mode raises all of a band of 4 %, hum and the harmonics of a drive only lines in it: medians are compared, without
+    the band's three largest lines. A peak that the described motion ``described_um`` (n,) has as well, or that does not
+    go on in each quarter of the record, is the drive's.
+    """
+    n, f = left_um.size, np.fft.rfftfreq(left_um.size, dt_s)
+    left, described = (np.where(mask, x - x.mean(), 0.0) for x in (left_um, described_um))
+    powers = [np.square(np.abs(np.fft.rfft(x * np.hanning(n)))) for x in (left, described)]
+    best, at_hz = _RINGS, 0.0
+    for f_hz in np.geomspace(125.0, 0.47 * n, 400) / (n * dt_s) if n > 300 else ():
+        off = np.abs(f / f_hz - 1.0)
+        inside, beside = off < 0.02, (off > 0.06) & (off < 0.3)
+        ratio, driven = (float(np.median(np.sort(p[inside])[:-3]) / max(np.median(p[beside]), 1e-300)) for p in powers)
+        if ratio > best * max(driven, 1.0):
+            best, at_hz = ratio / max(driven, 1.0), float(f_hz)
+    band = np.abs(f / max(at_hz, 1e-9) - 1.0) < 0.06
+    # Faded, since the ends of the record are steps.
+    faded = left * np.minimum(1.0, 10.0 * np.minimum(np.arange(n), np.arange(n)[::-1]) / n)
+    quarters = [float(q @ q) for q in np.array_split(np.fft.irfft(np.fft.rfft(faded) * band, n), 4)]
+    if min(quarters) < 0.05 * sum(quarters) or not at_hz:
+        return 0.0, 0.0
+    return at_hz, float(powers[0][band].sum() / powers[0].sum())
+
+
+def _ringing_hz(readings: Readings) -> float:
+    if readings.data.has_mode:
+        # It is the stage's own.
+        return 0.0
+    return ringing_peak(readings.left_um, readings.memory_um, readings.mask, readings.data.dt_s)[0]
+
+
+def find_ringing(data: FitData, residual_um: FloatArray, mask: BoolArray, sigma_um: float) -> FoundInReadings | None:
+    """A mode that makes a fifth of what is left: disturbances excite it, not the voltage."""
+    f_hz, share = ringing_peak(residual_um, data.y_um - residual_um, mask, data.dt_s)
+    if data.has_mode or share <= 0.2:
+        return None
+    words = f"what is left of the readings rings at {f_hz:.4g} Hz"
+    return FoundInReadings({"f0_hz": f_hz}, {"f0_hz": (0.96 * f_hz, 1.04 * f_hz)}, share, words)
+
+
+def ringing_in_library(parameters: dict[str, float]) -> tuple[tuple[Effect, ...], float]:
+    return (RESONANCE.clipped(frequency_Hz=parameters["f0_hz"]),), 0.0
+
+
+def rings(readings: Readings) -> Sight:
+    """A peak in the spectrum of what plays of the voltage leave of the readings."""
+    peak_hz = readings.once(_ringing_hz)
+    if not peak_hz:
+        return Sight(None, "no peak in the spectrum of what the loop leaves")
+    return Sight(True, f"what the loop leaves rings at {peak_hz:.4g} Hz")
+
+
 RESONANCE = Kind(
     name="resonance",
     place=Place.MECHANICS,
@@ -174,10 +242,13 @@ RESONANCE = Kind(
     tells_apart="hum is a fixed line that is there without excitation",
     source="300 to 500 Hz, damping 0.01 to 0.05 for a 100 µm flexure stage (common knowledge of the field)",
     cause=Cause(
-        sign="a peak in the frequency response, with the phase turn of a mode",
+        sign="a peak in the frequency response, with the phase turn of a mode; or in the spectrum of what the loop "
+        "leaves",
         forms=(Resonance(), StructureModes()),
-        tests=(seen,),
-        in_library=in_library,
+        tests=(seen, rings),
+        # Of parallel modes the strongest becomes one in series.
+        in_library=same_numbers("resonance", frequency_Hz="f0_hz", damping_ratio="damping"),
         picture=pictures.frequency_response,
+        in_readings=InReadings(find_ringing, ringing_in_library),
     ),
 )

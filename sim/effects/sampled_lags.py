@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.effects.slew_limit import seen as speed_is_limited
+from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
 from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
-    from dehyst.sim.fitting.fit_data import FitData
     from dehyst.sim.readings.readings import Readings, Response
 
 
@@ -106,22 +107,38 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     return LagsOfResponse("", late, words, lagged, lag_words, lags_s, lag_error_s)
 
 
-def apart(nominal: FloatArray, names: tuple[str, ...]) -> list[FloatArray]:
-    """A joint start (`CauseModel.joint_starts`) with a short lag of the stage and a long further one.
+@dataclass(frozen=True)
+class FurtherLag(CauseModel):
+    """A first-order lag beside the stage's own, at the block ``at``."""
 
-    Calibrated alone, the stage's own lag is nearly the sum of both. A fit from there can end at two equal lags.
-    """
-    if "tau_s" not in names:
-        return []
-    at = names.index("tau_s")
-    start = nominal.copy()
-    start[at] *= 0.2
-    return [np.append(start, 0.8 * nominal[at])]
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
+    fast: bool = True
+    at: ActsOn = ActsOn.DYNAMICS
 
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        dt_s = data.dt_s
+        return (ModelParameter("tau_s", "s", 0.0, 0.0, max(0.03, 20.0 * dt_s), max(1e-4, 0.1 * dt_s), self.at),)
 
-def is_of_the_recorder(tau_s: float, data: FitData) -> bool:
-    """Whether a lag is too short to be told from the recorder's latch and hold."""
-    return tau_s < 0.15 * data.dt_s
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
+        # A shorter one cannot be told from the recorder's latch and hold.
+        return float(p[0]) >= 0.15 * data.dt_s
+
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        return agrees(float(p[0]), readings)
+
+    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
+        """A short lag of the stage and a long further one. Calibrated alone, the stage's own lag is nearly the sum of
+        both, and a fit from there can end at two equal lags."""
+        if "tau_s" not in names:
+            return []
+        at = names.index("tau_s")
+        start = nominal.copy()
+        start[at] *= 0.2
+        return [np.append(start, 0.8 * nominal[at])]
+
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        return single_guesses([f * data.dt_s for f in (0.1, 0.3, 1.0, 3.0, 10.0)])
 
 
 def second_lag(readings: Readings) -> Sight:

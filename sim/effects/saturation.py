@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, FoundInReadings, InLibrary, InReadings, Kind, Parameter, Place, block
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from dehyst.sim.fitting.stage_model import CauseModel, Guess
 from dehyst.sim.masks import samples_since
+from dehyst.sim.readings.noise import reading_limits
 from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
@@ -77,44 +78,7 @@ class Saturation(CauseModel):
         return np.clip(u_V, p[1], p[0])
 
 
-@dataclass(frozen=True)
-class ClippedReading(CauseModel):
-    """Readings that end at the upper or the lower limit of a sensor or its converter."""
-
-    variant: str = "reading"
-    unseen_is_absent: bool = True
-
-    def missing(self, data: FitData) -> str:
-        return "" if any(_clipped(data.y_um)) else "readings that stand at one limit"
-
-    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        low, high, r = float(np.min(data.y_um)), float(np.max(data.y_um)), data.range_um
-        return (
-            ModelParameter("y_max_um", "µm", high + r, low, high + r, 0.01 * r, ActsOn.READING),
-            ModelParameter("y_min_um", "µm", low - r, low - r, high, 0.01 * r, ActsOn.READING),
-        )
-
-    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        low, high, r = float(np.min(data.y_um)), float(np.max(data.y_um)), data.range_um
-        bottom, top = _clipped(data.y_um)
-        return [[np.array([high if top else high + r, low if bottom else low - r])]]
-
-    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
-        return np.clip(y_um, p[1], p[0])
-
-
-def _clipped(y_um: FloatArray) -> tuple[bool, bool]:
-    """Whether the readings (n,) stand at a lower and at an upper limit: twenty of them, and ten times as many as on the
-    next level, where the noise of a stage or the levels of a converter have no such step."""
-    _, count = np.unique(y_um, return_counts=True)
-    if count.size < 3:
-        return False, False
-    return bool(count[0] >= max(20, 10 * count[1])), bool(count[-1] >= max(20, 10 * count[-2]))
-
-
 def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    if form.variant == "reading":
-        return None
     v = {name: value for name, (value, _) in form.reported(p, data).items()}
     low_V = min(v["u_min_V"], 0.0) - 1e-3 * data.swing_V
     return InLibrary((SATURATION.clipped(high_V=v["u_max_V"], low_V=low_V),))
@@ -196,13 +160,17 @@ def in_steps(readings: Readings) -> Sight:
     return Sight(None, "no step near the ends of the range is much smaller than the others")
 
 
-def in_readings(readings: Readings) -> Sight:
-    """Readings that stand at their largest or smallest value, at which no noise moves them."""
-    bottom, top = _clipped(readings.data.y_um[readings.mask])
-    ends = " and ".join(word for word, clipped in (("top", top), ("bottom", bottom)) if clipped)
-    if not ends:
-        return Sight(None, "no limit at which the readings stand")
-    return Sight(True, f"the readings stand at one value at the {ends} of their range")
+def find_limits(data: FitData, residual_um: FloatArray, mask: BoolArray, sigma_um: float) -> FoundInReadings | None:
+    """Readings that end at a limit of the sensor or its converter. They count in no fit."""
+    low, high = reading_limits(data)
+    found = {name: at for name, at in (("y_max_um", high), ("y_min_um", low)) if np.isfinite(at)}
+    if not found:
+        return None
+    cut = (data.y_um <= low) | (data.y_um >= high)
+    error = np.square(residual_um)
+    share = float(error[cut].sum() / error[cut | mask].sum())
+    words = f"the readings stand at one value at {' and at '.join(f'{at:.4g} µm' for at in found.values())}"
+    return FoundInReadings(found, {name: (at, at) for name, at in found.items()}, share, words)
 
 
 SATURATION = Kind(
@@ -219,11 +187,11 @@ SATURATION = Kind(
     tells_apart="a sensor that ends is told apart by a monitor of the voltage",
     source="-30 to 130 V at the actuator behind a tenfold amplifier (E-503 class data sheet range)",
     cause=Cause(
-        sign="flat tops of the readings while the voltage moves; steps near an end that hardly move them; or readings "
-        "that stand at one value",
-        forms=(Saturation(), ClippedReading()),
-        tests=(seen, in_steps, in_readings),
+        sign="flat tops of the readings while the voltage moves; or steps near an end that hardly move them",
+        forms=(Saturation(),),
+        tests=(seen, in_steps),
         in_library=in_library,
         picture=pictures.over_voltage,
+        in_readings=InReadings(find_limits, lambda parameters: ((), 0.0)),
     ),
 )

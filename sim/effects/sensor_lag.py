@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
 from dehyst.sim.effects.holds import first_order
-from dehyst.sim.effects.sampled_lags import agrees, apart, is_of_the_recorder, second_lag
+from dehyst.sim.effects.sampled_lags import FurtherLag, second_lag
 from dehyst.sim.fitting.dynamics import Dynamics
-from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
-
-if TYPE_CHECKING:
-    from dehyst.sim.readings.readings import Readings
 
 # Its step in the simulation.
 
@@ -42,35 +37,11 @@ def derive_sensor_lag(values: Mapping[str, float], context: Context) -> Sequence
 
 
 @dataclass(frozen=True)
-class SensorLag(CauseModel):
+class SensorLag(FurtherLag):
     """A first-order low-pass in the sensor's electronics."""
-
-    test_answers_to_others: bool = True
-    unseen_is_absent: bool = True
-    fast: bool = True
-
-    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        return (ModelParameter("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * data.dt_s), ActsOn.DYNAMICS),)
-
-    def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return not is_of_the_recorder(float(p[0]), data)
-
-    def agreement(self, p: FloatArray, readings: Readings) -> str:
-        return agrees(float(p[0]), readings)
-
-    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        return apart(nominal, names)
-
-    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        return single_guesses([f * data.dt_s for f in (0.1, 0.3, 1.0, 3.0, 10.0)])
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return replace(system, lags_s=(*system.lags_s, float(p[0]))) if p[0] > 1e-7 else system
-
-
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((SENSOR_LAG.clipped(tau_s=v["tau_s"]),))
 
 
 SENSOR_LAG = Kind(
@@ -88,7 +59,7 @@ SENSOR_LAG = Kind(
         sign="a lag beside the stage's own in phase and gain of the response, with what happens within a sample",
         forms=(SensorLag(),),
         tests=(second_lag,),
-        in_library=in_library,
+        in_library=same_numbers("sensor_lag", tau_s="tau_s"),
         picture=pictures.after_steps,
         same_as=("amplifier_lag",),
     ),

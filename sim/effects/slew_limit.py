@@ -11,7 +11,7 @@ import numpy as np
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
+from dehyst.sim.effects.base import Cause, Kind, Parameter, Place, block, same_numbers
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
 from dehyst.sim.readings.sight import Sight
@@ -75,11 +75,6 @@ class SlewLimit(CauseModel):
 
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         return slew_ends(u_V, max(float(p[0]) * data.dt_s, 1e-12), data.straight)
-
-
-def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((SLEW_LIMIT.clipped(rate_V_per_s=v["slew_V_per_s"]),))
 
 
 # Its signature in the readings.
@@ -197,7 +192,7 @@ SLEW_LIMIT = Kind(
         sign="the greatest speed does not grow with the step, or with the speed that is asked for",
         forms=(SlewLimit(),),
         tests=(seen,),
-        in_library=in_library,
+        in_library=same_numbers("slew_limit", rate_V_per_s="slew_V_per_s"),
         picture=pictures.after_steps,
     ),
 )

@@ -215,6 +215,38 @@ class FitData:
         return np.asarray(still & settled & (samples_until(~still) > EARLY_S / self.dt_s))
 
     @property
+    def turns(self) -> list[int]:
+        """Samples at which the voltage turns by more than a tenth of its swing: a ripple on a slow move is no turn."""
+        return self._derived.get("turns", self._turns)
+
+    def _turns(self) -> list[int]:
+        u, least = self.u_V, 0.1 * self.swing_V
+        turns: list[int] = []
+        way, high, low = 0, 0, 0
+        for k in np.flatnonzero(np.diff(u, prepend=u[0]) != 0.0):
+            if u[k] > u[high]:
+                high = int(k)
+            if u[k] < u[low]:
+                low = int(k)
+            if way >= 0 and u[high] - u[k] > least:
+                turns.append(high)
+                way, low = -1, int(k)
+            elif way <= 0 and u[k] - u[low] > least:
+                turns.append(low)
+                way, high = 1, int(k)
+        # The last bottom ends with the record.
+        return [*turns, low] if way < 0 else turns
+
+    @property
+    def strokes(self) -> tuple[FloatArray, FloatArray]:
+        """Duration (s) without rests, and mean rate (V/s), of each move from one turn of the voltage to the next."""
+        at = np.array([0, *self.turns], dtype=np.int64)
+        moving_s = np.diff(np.cumsum(self.rate_V_per_s > 0.0)[at]) * self.dt_s
+        way_V = np.abs(np.diff(self.u_V[at]))
+        real = (moving_s > 0.0) & (way_V > 0.05 * self.swing_V)
+        return moving_s[real], way_V[real] / moving_s[real]
+
+    @property
     def begins_at_rest(self) -> bool:
         """Whether the drive stays within 1 % of its swing about zero volts for the first 20 ms."""
         first = self.u_V[: max(3, round(0.02 / self.dt_s))]

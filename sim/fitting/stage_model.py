@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,39 +17,57 @@ if TYPE_CHECKING:
     from dehyst.sim.readings.readings import Readings
 
 
-class NominalStage(Protocol):
+@dataclass(frozen=True)
+class NominalStage:
     """A stage that a recording is compared with. Its parameters are calibrated before causes are searched."""
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def hold(self) -> str: ...
+    #: The voltage is held over a sample ("zero") or runs straight to the next ("first").
+    hold: str = "zero"
+    name: str = ""
+    #: What happened before the first sample is described by further parameters, behind its own.
+    free_memory: bool = False
+
     @property
     def substeps(self) -> int:
         """Sub-steps per sample at which drive and hysteresis are simulated."""
-        ...
+        # h is curved while the voltage runs linearly between samples; under a held voltage one exact step suffices.
+        return 4 if self.hold == "first" else 1
 
-    def with_other_hold(self) -> NominalStage: ...
+    @property
+    def remembers(self) -> bool:
+        """Whether what happened before the first sample matters."""
+        return True
+
+    def with_other_hold(self) -> NominalStage:
+        return replace(self, hold="zero" if self.hold == "first" else "first")
+
     def with_free_memory(self) -> NominalStage:
-        """With what happened before the first sample as further parameters, behind its own; itself where it has them,
-        or has no memory."""
-        ...
+        return replace(self, free_memory=True) if self.remembers and not self.free_memory else self
 
-    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]: ...
-    def starts(self, data: FitData) -> list[FloatArray]: ...
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        raise NotImplementedError
+
+    def starts(self, data: FitData) -> list[FloatArray]:
+        """Start values of the calibration."""
+        raise NotImplementedError
+
     def static(self, drive_V: FloatArray, p: FloatArray, data: FitData) -> tuple[FloatArray, FloatArray]:
         """Hysteresis h and static displacement w (µm, (n,) each) for the voltage at the actuator."""
-        ...
+        raise NotImplementedError
 
-    def dynamics(self, p: FloatArray, data: FitData) -> Dynamics: ...
+    def dynamics(self, p: FloatArray, data: FitData) -> Dynamics:
+        raise NotImplementedError
+
     def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
         """(n,) displacement behind the mechanics after what the stage itself adds there."""
-        ...
+        return x_um
 
-    def offset_um(self, p: FloatArray) -> float: ...
+    def offset_um(self, p: FloatArray) -> float:
+        raise NotImplementedError
+
     def start_um(self, p: FloatArray) -> float:
         """Distance (µm) of the first sample from equilibrium with the first voltage."""
-        ...
+        return 0.0
 
 
 #: Parameters of the initial state: only the first samples determine them, so they cannot be held out.
@@ -91,7 +109,7 @@ class CauseModel:
     must_be_seen: bool = False
     #: So smooth in time that it imitates the rest of many others: where its test is not excited, it must explain most.
     imitates_others: bool = False
-    #: It approximates a class of stages, each stretch with another error: its size may differ between stretches.
+    #: It approximates a class of loops: a loop of free form beside it would take its number over.
     approximates: bool = False
     #: Reported numbers of which the nominal stage may take any part over: not zero where the cause is not there.
     shared: tuple[str, ...] = ()

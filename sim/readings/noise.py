@@ -145,6 +145,19 @@ def converter_grid(y_um: FloatArray) -> ConverterGrid:
     return ConverterGrid(step if float(np.quantile(off, 0.99)) < 0.05 else 0.0, int(levels.size))
 
 
+def reading_limits(data: FitData) -> tuple[float, float]:
+    """The lower and the upper limit (µm) at which readings stand while the voltage moves; infinite if there is none.
+
+    Twenty readings stand there, and ten times as many as on the next level: the noise of a stage and the levels of a
+    converter have no such step.
+    """
+    levels, count = np.unique(data.y_um[data.rate_V_per_s > 0.0], return_counts=True)
+    if count.size < 3:
+        return -math.inf, math.inf
+    low = float(levels[0]) if count[0] >= max(20, 10 * count[1]) else -math.inf
+    return low, float(levels[-1]) if count[-1] >= max(20, 10 * count[-2]) else math.inf
+
+
 @dataclass(frozen=True)
 class RepeatedReadings:
     """Readings that repeat the one before during motion: ``count`` of ``of`` readings where it could be seen."""

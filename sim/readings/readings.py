@@ -125,24 +125,7 @@ class Readings:
         """Closed cycles of at least 10 % of the swing whose two bottoms differ by less than 3 % of their height."""
         u = self.data.u_V
         least = 0.1 * self.data.swing_V
-        turns: list[int] = []
-        way, high, low = 0, 0, 0
-        # Reversals by more than ``least``: a ripple on a slow move makes no cycle.
-        for k in np.flatnonzero(np.diff(u, prepend=u[0]) != 0.0):
-            if u[k] > u[high]:
-                high = int(k)
-            if u[k] < u[low]:
-                low = int(k)
-            if way >= 0 and u[high] - u[k] > least:
-                turns.append(high)
-                way, low = -1, int(k)
-            elif way <= 0 and u[k] - u[low] > least:
-                turns.append(low)
-                way, high = 1, int(k)
-        # The last bottom ends with the record.
-        if way < 0:
-            turns.append(low)
-        out = []
+        turns, out = self.data.turns, []
         for a, b, c in zip(turns[:-2], turns[1:-1], turns[2:], strict=True):
             # A standing voltage before the first rise does not belong to the cycle.
             a += int(np.flatnonzero(u[a : b + 1] <= u[a] + 1e-6 * least)[-1])

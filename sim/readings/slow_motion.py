@@ -222,17 +222,16 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     if len(same) < 5 or (same[-1].stop - same[0].start) < 0.15 * data.n:
         return CyclesOverTime("no motion is repeated often enough, over long enough a time")
     t = np.array([0.5 * (c.start + c.stop) * data.dt_s for c in same])
-    heights, means = [], []
-    for c in same:
-        turn = data.y_um[c.start : c.stop]
-        phase = 2.0 * np.pi * (np.arange(turn.size) / turn.size)
-        means.append(float(turn.mean()))
-        heights.append(float(np.hypot(turn @ np.cos(phase), turn @ np.sin(phase))) * 2.0 / turn.size)
-    height = np.array(heights)
-    relative = height / height.mean() - 1.0
+    # Samples of a cycle that count in all cycles, and by how much each cycle is taller than the usual one.
+    at = np.array([np.linspace(c.start, c.stop, min(c.stop - c.start for c in same), endpoint=False) for c in same])
+    turns = np.interp(at, np.arange(data.n), data.y_um)[:, readings.mask[np.rint(at).astype(np.int64)].all(axis=0)]
+    if turns.shape[1] < at.shape[1] // 2:
+        return CyclesOverTime("too few samples count in all cycles")
+    means_um = turns.mean(axis=1)
+    usual = turns.mean(axis=0) - float(turns.mean())
+    relative = turns @ usual / float(usual @ usual) - 1.0
     change, error = _slope(t, relative)
     # What of the mean goes with the height is a change of the gain, about some displacement that the stage reaches.
-    means_um = np.array(means)
     if abs(change) > _SIGMAS * error:
         level_um = float(relative @ means_um) / float(relative @ relative)
         means_um -= relative * float(np.clip(level_um, -data.range_um, data.range_um))

@@ -33,11 +33,6 @@ class Split:
         """Sums over the blocks along the last axis."""
         return np.asarray(np.add.reduceat(values, self.edges[:-1], axis=-1))
 
-    def stretch_sums(self, per_block: FloatArray) -> FloatArray:
-        """Sums over the stretches (neighbouring blocks of one fold) of values per block (b,)."""
-        first = np.flatnonzero(np.diff(self.fold, prepend=-1))
-        return np.asarray(np.add.reduceat(per_block, first))
-
     def samples(self, fold: int) -> BoolArray:
         """Samples of one fold."""
         return np.repeat(self.fold == fold, np.diff(self.edges))

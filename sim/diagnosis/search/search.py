@@ -17,7 +17,6 @@ from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from dehyst.sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from dehyst.sim.diagnosis.search.intervals import across_zero, parameter_errors
 from dehyst.sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
-from dehyst.sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
 from dehyst.sim.fitting.calibration import (
     calibrate,
     clipped_to_bounds,
@@ -65,19 +64,11 @@ class Thresholds:
     #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative ...
     close_share: float = 0.02
     close_sigmas: float = 2.5
-    #: ... where its error is at most this many times the accepted one.
-    close_error: float = 2.0
     #: Where no direct test sees a cause, one that it is easily mistaken for is an alternative if it lacks less than
     #: this share of the gain: no form is exact on a measured stage.
     close_unseen: float = 0.5
     #: Most names in a set of a cause and what it is mistaken for.
     widest: int = 3
-    #: Largest spread of a cause's size between the stretches that excite it, where at least so many excite it.
-    most_spread: float = 0.28
-    #: The same where its signature is seen: no form is exact on a measured stage, but one that vanishes in some
-    #: stretches stands for another effect.
-    most_spread_seen: float = 1.0
-    fewest_stretches: int = 6
     #: Least share of the error that a cause must remove whose numbers may all be zero: a loop's form has such numbers.
     least_about_zero: float = 0.25
 
@@ -181,18 +172,6 @@ class AcceptedCause:
     gain: float
 
 
-@dataclass(frozen=True)
-class UnsteadyCause:
-    """A cause that is not named because its size changes from stretch to stretch.
-
-    ``share``: what it removes of the held-out squared error of all other causes together.
-    """
-
-    name: str
-    share: float
-    stretches: StretchSizes
-
-
 @dataclass
 class Search:
     """The greedy search. `run` returns the accepted model."""
@@ -218,8 +197,6 @@ class Search:
     nominal_um2: float = 0.0
     #: What the form of each accepted cause may leave over, per block (µm²).
     left_um2: dict[str, FloatArray] = field(default_factory=dict)
-    #: Causes that the review dropped because their size changes from stretch to stretch.
-    unsteady: list[UnsteadyCause] = field(default_factory=list)
     #: Causes that the review dropped because their numbers may all be zero.
     uncertain: set[str] = field(default_factory=set)
     #: Accepted causes whose direct test answers to others as well, but gives a number that agrees with the fit.
@@ -373,11 +350,11 @@ class Search:
         if self.is_line(best.cause, q, base):
             # A line of less than a twentieth of the noise is none that matters.
             return gain > _LINE * self.noise_um2
-        ends = [v != s.neutral and not s.low < v < s.high for s, v in zip(parameters, q, strict=True) if not s.linear]
-        if len(parameters) <= 2 and any(ends):
-            # A number at its bound is none that was found. Of the many of a free form some may be.
-            return False
-        if not self.plausible(best):
+        numbers = best.cause.reported(q, best.fit.model.data).values()
+        told = np.any([gradient != 0.0 for _, gradient in numbers], axis=0)
+        ends = [v != s.neutral and not s.low < v < s.high and not s.linear for s, v in zip(parameters, q, strict=True)]
+        # A reported number at its bound is none that was found. Of the many of a free form a few may be.
+        if 2 * np.sum(told & ends) >= max(1, np.sum(told)) or not self.plausible(best):
             return False
         now, after = held.per_block_um2, best.held.per_block_um2
         share = self.share(gain, held)
@@ -460,6 +437,9 @@ class Search:
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             self.left_um2[accepted.cause.name] = accepted.cause.model_error**2 * gone
+            if self.seen(accepted.cause):
+                # The error that the loop's form is compared with is that of a stage that has what the readings show.
+                self.nominal_um2 -= held.sse_um2 - accepted.held.sse_um2
             current, held = accepted.fit, accepted.held
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
@@ -521,10 +501,9 @@ class Search:
     def _looks_beside(self, fit: ModelFit) -> tuple[list[ScreenedCause], list[CauseModel]]:
         """The guesses beside the causes of ``fit``, without those that the review dropped."""
         names = {cause.name for cause in fit.model.causes}
-        dropped = {cause.name for cause in self.unsteady} | self.uncertain
         # What a direct test cannot tell from a cause that is there, and is seen by the same, is that cause once more.
         either = {other for name in names for other in self.shown_as_well(name) if name in self.shown_as_well(other)}
-        return self.looks(fit, self.catalogue.same_set(names) | dropped | either)
+        return self.looks(fit, self.catalogue.same_set(names) | self.uncertain | either)
 
     def _last(self, candidate: CauseCandidate, index: int) -> tuple[CauseCandidate, ModelFit]:
         """An earlier cause of a candidate's model as the candidate, and the model without it."""
@@ -653,17 +632,6 @@ class Search:
                 return better, self.held(better)
         return fit, held
 
-    def stretches(self, fit: ModelFit, less: ModelFit) -> StretchSizes:
-        """The size by stretch of the cause of ``fit`` that ``less`` lacks."""
-        return sizes_by_stretch(less.residual_um * self.mask, fit.residual_um * self.mask, self.parts, self.sigma_um)
-
-    def steady(self, cause: CauseModel, stretches: StretchSizes) -> bool:
-        """Whether nothing speaks against one size of the cause in all stretches: the creep of a real stack spreads by
-        0.30."""
-        few = stretches.sizes.size < self.thresholds.fewest_stretches
-        most = self.thresholds.most_spread_seen if self.seen(cause) else self.thresholds.most_spread
-        return few or cause.approximates or stretches.spread <= most
-
     def may_be_zero(self, fit: ModelFit, index: int, small: bool) -> bool:
         """Whether the intervals of all its numbers hold zero, of a cause that removes little or that is never zero."""
         if not small and not fit.model.causes[index].never_zero:
@@ -716,8 +684,8 @@ class ReviewedCause:
 def review(
     search: Search, fit: ModelFit, held: HeldOut, steps: dict[str, AcceptedCause]
 ) -> tuple[ModelFit, HeldOut, list[ReviewedCause]]:
-    """Remove each cause once more: drop it if idle, if it removes little and its numbers may be zero, or if its size
-    changes from stretch to stretch (`Search.unsteady`); replace it if another explains more; collect its rivals."""
+    """Remove each cause once more: drop it if idle, or if it removes little and its numbers may be zero; replace it if
+    another explains more; collect its rivals."""
     thresholds = search.thresholds
     found: list[ReviewedCause] = []
     index = swaps = 0
@@ -732,13 +700,8 @@ def review(
             fit, held = less, held_less
             found, index = [], 0
             continue
-        zero = search.may_be_zero(fit, index, small)
-        stretches = search.stretches(fit, less)
-        if zero or not search.steady(cause, stretches):
-            if zero:
-                search.uncertain.add(cause.name)
-            else:
-                search.unsteady.append(UnsteadyCause(cause.name, gain / held_less.sse_um2, stretches))
+        if search.may_be_zero(fit, index, small):
+            search.uncertain.add(cause.name)
             # It may have stood in the place of another cause.
             fit, held, more = search.extended(*search.filled(less))
             steps |= {step.name: step for step in more}
@@ -787,7 +750,6 @@ def _rivals(
             continue
         lost, sigmas = worse_by(rival.held, held)
         close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
-        close = close and rival.held.sse_um2 < thresholds.close_error**2 * held.sse_um2
         more = {other.cause.name for other in out} | {rival.cause.name}
         if not close and rival.cause.name in mates and len(there | more) <= thresholds.widest:
             # What falls a little short may do so because its form is coarse.

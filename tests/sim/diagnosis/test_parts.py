@@ -18,11 +18,10 @@ from dehyst.sim.diagnosis.search.held_out import split
 from dehyst.sim.diagnosis.search.screening import ScreenedCause, p_value
 from dehyst.sim.effects import effect, simulate
 from dehyst.sim.effects.hysteresis_shape import HysteresisShape
-from dehyst.sim.effects.rate_dependence import RATE_DEPENDENCE, RateDependence
-from dehyst.sim.effects.resonance import Resonance
-from dehyst.sim.effects.stick_slip import StickSlip, friction, in_library
+from dehyst.sim.effects.rate_dependence import RateDependence
+from dehyst.sim.effects.stick_slip import StickSlip, friction
 from dehyst.sim.effects.timing import resample
-from dehyst.sim.fitting.calibration import DampingRule, calibrate, damped_step, free_indices
+from dehyst.sim.fitting.calibration import calibrate
 from dehyst.sim.fitting.dynamics import Dynamics, respond
 from dehyst.sim.fitting.fit_data import ActsOn, FitData
 from dehyst.sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
@@ -34,7 +33,6 @@ from dehyst.sim.readings.noise import (
     repeated_period,
     repeated_readings,
 )
-from dehyst.sim.readings.slow_motion import Change
 from dehyst.sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 
@@ -125,24 +123,6 @@ def test_a_rate_dependence_widens_the_loops_of_the_causes_beside_it() -> None:
     assert np.all(wider[moving] * loop[moving] < 0.0)
 
 
-def test_the_driving_term_of_a_loop_that_is_not_there_is_not_fitted() -> None:
-    """Beside plays that took the loop over, nothing shows its number: it ran to its bound and hid the growth."""
-    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 5.0 * np.arange(400) * DT)
-    form = RateDependence(with_slope=False)
-    model = StageModel(FitData(DT, u, 10.0 * u), BoucWenStage("zero"), (form,))
-    moves = {model.parameters[i].name for i in free_indices(model)} & {s.name for s in form.parameters(model.data)}
-    assert moves == {"width_per_decade", "gain_per_decade", "log_v0"}
-    assert all(not row[1] for rows in form.guesses(model.data, u) for row in rows)
-    assert form in RATE_DEPENDENCE.cause.forms
-
-
-@pytest.mark.parametrize(("f_hz", "plausible"), [(900.0, True), (939.0, False), (940.0, False)])
-def test_a_mode_at_the_top_of_what_the_sampling_shows_is_none(f_hz: float, plausible: bool) -> None:
-    """0.47 of 2 kHz are 940 Hz: there it stands for what is faster."""
-    u = np.sin(np.arange(400) / 50.0)
-    assert Resonance().plausible(np.log([f_hz, 0.1]), FitData(DT, u, u)) is plausible
-
-
 def test_a_simulation_from_a_later_block_gives_what_a_whole_one_gives() -> None:
     """Columns are differences of such simulations; the start, far from equilibrium, must not count twice."""
     u = _steps(4002)
@@ -206,20 +186,6 @@ def test_contact_that_breaks_free_in_parts_slides_as_friction_with_presliding_do
     np.testing.assert_allclose(form.motion(x, np.array([0.02, 0.0]), data), plays(x, np.array([0.02]))[0], atol=1e-12)
 
 
-def test_friction_is_fitted_in_parts_only_where_something_is_left() -> None:
-    data = FitData(DT, np.sin(np.arange(400) / 50.0), np.sin(np.arange(400) / 50.0))
-    p = np.array([0.01, 0.8])
-    assert StickSlip().refined(p, 1.1, data) is None
-    found = StickSlip().refined(p, 1.2, data)
-    assert found is not None
-    finer, starts = found
-    assert all(start[0] == 0.008 for start in starts)
-    assert finer.refined(starts[0], 9.0, data) is None
-    effect = in_library(finer, starts[0], data)
-    assert effect is not None
-    assert effect.refit
-
-
 def test_resampling_is_exact_for_a_parabola() -> None:
     k = np.arange(1000.0)
     got = resample(k * k, 1e-4, 0.25)
@@ -253,37 +219,6 @@ def test_calibration_finds_the_librarys_bouc_wen_stage() -> None:
     assert got["rise_per_V"] == pytest.approx(1.9, rel=1e-2)
     assert got["tau_s"] == pytest.approx(8e5 / 3.5244e8, rel=1e-2)
     assert got["offset_um"] == pytest.approx(3.0, abs=0.01)
-
-
-@pytest.mark.parametrize(("longest", "found"), [(0.2, True), (0.01, False)])
-def test_eight_trials_reach_a_step_of_a_tenth(longest: float, found: bool) -> None:
-    """Far from its minimum only a short step lowers the error; there a fit must not give up."""
-    rule = DampingRule(least=1e-9, least_after_failure=1e-5, rcond=1e-13)
-    tried: list[float] = []
-
-    def trial(move: FloatArray) -> tuple[float, float]:
-        tried.append(abs(float(move[0])))
-        return (0.5 if tried[-1] < longest else 2.0), tried[-1]
-
-    better, _ = damped_step(np.ones((1, 1)), np.ones(1), np.ones(1), 1e-6, rule, 8, 1.0, trial)
-    assert len(tried) == 8
-    assert (better == tried[-1]) is found
-
-
-def test_a_change_agrees_from_two_and_a_half_errors_on() -> None:
-    faint, clear = Change(0.24, 0.1), Change(-0.26, 0.1)
-    assert not faint.agrees(0.24)
-    assert clear.agrees(-0.2)
-    assert not clear.agrees(-0.37)
-    assert not clear.agrees(0.26)
-
-
-@pytest.mark.parametrize(("widest", "seen"), [(0.0, False), (0.04, False), (0.06, None)])
-def test_a_change_is_excluded_only_where_each_part_of_the_record_would_show_it(
-    widest: float, seen: bool | None
-) -> None:
-    assert Change(0.01, 0.02, widest=widest).seen(0.01, 0.005, 0.1) is seen
-    assert Change(0.2, 0.02, widest=widest).seen(0.2, 0.005, 0.1) is True
 
 
 def test_noise_floor_sees_noise_and_not_creep() -> None:

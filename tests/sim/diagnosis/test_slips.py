@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,7 +11,6 @@ from dehyst.sim.effects.timing import (
     date_slips,
     find_slips,
     merge_close_slips,
-    without_small_slips,
 )
 from dehyst.sim.readings.lateness import SlipList
 
@@ -59,27 +55,6 @@ def test_from_nothing_one_move_after_the_other_finds_them_all() -> None:
     assert found == truth
 
 
-def test_two_that_were_taken_for_one_come_apart() -> None:
-    truth: SlipList = ((900, 1), (2500, 1), (4100, 1))
-    y_um, there, model = slipped(truth, np.random.default_rng(6)), np.ones(N, dtype=np.bool_), motion()[:N]
-    after, _ = best_slip_move(((900, 1), (2500, 2)), y_um, model, there)
-    assert date_slips(after, y_um, model, there) == truth
-
-
-def test_a_gain_is_the_squared_error_that_a_move_takes_off() -> None:
-    truth: SlipList = ((1500, 1), (3000, 1))
-    y_um, there, model = slipped(truth, np.random.default_rng(3)), np.ones(N, dtype=np.bool_), motion()[:N]
-
-    def sse_um2(found: SlipList) -> float:
-        shifts = np.zeros(N, dtype=np.int64)
-        for at, size in found:
-            shifts[at:] += size
-        return float(np.sum((y_um - model[np.clip(np.arange(N) + shifts, 0, N - 1)]) ** 2))
-
-    after, gain_um2 = best_slip_move(((1500, 1),), y_um, model, there)
-    assert sse_um2(((1500, 1),)) - sse_um2(after) == pytest.approx(gain_um2, rel=1e-9)
-
-
 def test_samples_that_do_not_count_date_nothing() -> None:
     y_um = slipped(((2000, 1),), np.random.default_rng(4))
     y_um[2100:2110] += 50.0
@@ -99,24 +74,3 @@ def test_healthy_readings_do_not_slip() -> None:
     y_um, there, model = slipped((), np.random.default_rng(5)), np.ones(N, dtype=np.bool_), motion()[:N]
     assert find_slips(y_um, model, there) == ()
     assert best_slip_move((), y_um, model, there)[1] < 40.0 * NOISE_UM**2
-
-
-def test_dropping_slips_ends_where_their_sizes_change_with_every_fit() -> None:
-    fits: list[SlipList] = []
-
-    def fitted(p: FloatArray, kept: SlipList) -> Any:
-        fits.append(kept)
-        # The largest of the sizes changes in every fit; the next slip shrinks to nothing.
-        sizes = np.array([7.0 + len(fits), *(float(size) for _, size in kept[1:-1]), 0.1])[: len(kept)]
-        return SimpleNamespace(p=sizes, sse_um2=1.0)
-
-    found = tuple((1000 * i, 2) for i in range(1, 9))
-    first = fitted(np.zeros(0), found)
-    fits.clear()
-    fit = without_small_slips(first, found, 0, fitted)
-    assert [len(kept) for kept in fits] == [7, 6, 5]
-    assert fit.p.size == 5
-    fits.clear()
-    steady = SimpleNamespace(p=np.array([9.0, 3.0]), sse_um2=1.0)
-    assert without_small_slips(steady, ((1000, 2), (2000, 3)), 0, fitted) is steady
-    assert not fits

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.sim.diagnosis.diagnose import without_start
+from dehyst.sim.diagnosis.diagnose import usable, without_start
 from dehyst.sim.diagnosis.witnesses import witnesses
 from dehyst.sim.effects.mains_hum import MainsHum
+from dehyst.sim.effects.rate_dependence import RateDependence
+from dehyst.sim.effects.resonance import find_ringing, ringing_peak
+from dehyst.sim.effects.saturation import find_limits
 from dehyst.sim.fitting.fit_data import FitData
+from dehyst.sim.readings.noise import reading_limits
 from dehyst.sim.readings.readings import Readings
 from dehyst.sim.readings.sight import Sight
 from tests.foreign.inject import inject
@@ -31,9 +35,14 @@ def sine() -> tuple[FloatArray, FloatArray]:
     return u, y + SIGMA_UM * rng.standard_normal(N)
 
 
-def sights(cause: str, seed: int = 3) -> tuple[dict[str, Sight], dict[str, float]]:
+def injected(cause: str, seed: int = 3) -> tuple[FitData, dict[str, float]]:
     u, y, truth = inject(DT, *sine(), cause, np.random.default_rng(seed)) if cause else (*sine(), {})
-    return witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM)), truth
+    return FitData(DT, u, y), truth
+
+
+def sights(cause: str, seed: int = 3) -> tuple[dict[str, Sight], dict[str, float]]:
+    data, truth = injected(cause, seed)
+    return witnesses(Readings(data, np.ones(data.n, dtype=np.bool_), SIGMA_UM)), truth
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
@@ -71,10 +80,50 @@ def test_a_hum_of_two_percent_of_the_range_is_within_its_bounds() -> None:
     assert MainsHum().parameters(data)[1].high > 0.02 * data.range_um
 
 
-def test_readings_that_end_at_a_limit_are_seen_and_those_on_a_coarse_grid_are_not() -> None:
-    assert sights("clipped_reading")[0]["saturation"].seen is True
-    assert sights("quantisation")[0]["saturation"].seen is not True
-    assert sights("")[0]["saturation"].seen is not True
+def test_readings_at_a_limit_are_told_from_those_on_a_coarse_grid_and_from_rests() -> None:
+    data, truth = injected("clipped_reading")
+    assert reading_limits(data) == (-np.inf, truth["y_max_um"])
+    whole = np.ones(N, dtype=np.bool_)
+    found = find_limits(data, 0.1 * np.ones(N), usable(data, whole), SIGMA_UM)
+    assert found is not None
+    assert found.parameters == {"y_max_um": truth["y_max_um"]}
+    assert not usable(data, whole)[data.y_um == truth["y_max_um"]].any()
+    for other in ("quantisation", ""):
+        assert reading_limits(injected(other)[0]) == (-np.inf, np.inf)
+    resting = FitData(DT, np.repeat([0.0, 4.0, 0.0, 2.0, 0.0], 800), np.repeat([0.0, 4.0, 0.0, 2.0, 0.0], 800))
+    assert reading_limits(resting) == (-np.inf, np.inf)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_mode_rings_in_what_the_loop_leaves_and_hum_does_not(seed: int) -> None:
+    data, truth = injected("resonance", seed)
+    mask = np.ones(N, dtype=np.bool_)
+    readings = Readings(data, mask, SIGMA_UM)
+    f_hz, share = ringing_peak(readings.left_um, readings.memory_um, mask, DT)
+    assert f_hz == pytest.approx(truth["f0_hz"], rel=0.04)
+    found = find_ringing(data, readings.left_um, mask, SIGMA_UM)
+    assert (found is not None) is (share > 0.2)
+    for other in ("mains_hum", "creep", ""):
+        quiet = Readings(injected(other, seed)[0], mask, SIGMA_UM)
+        assert ringing_peak(quiet.left_um, quiet.memory_um, mask, DT) == (0.0, 0.0)
+
+
+def test_equal_cycles_are_compared_by_the_samples_that_count_in_all_of_them() -> None:
+    """A drift under clipped tops: no cycle is whole."""
+    u, y = sine()
+    drifting = FitData(DT, u, np.minimum(y + 0.02 * DT * np.arange(N), 0.9 * float(y.max())))
+    mask = usable(drifting, np.ones(N, dtype=np.bool_))
+    assert 0.05 < np.mean(~mask) < 0.4
+    assert witnesses(Readings(drifting, mask, SIGMA_UM))["thermal_drift"].seen is True
+
+
+def test_one_period_shows_no_rate_dependence() -> None:
+    u, y = sine()
+    assert RateDependence().missing(FitData(DT, u, y))
+    growing = u * np.linspace(0.2, 1.0, N)
+    assert RateDependence().missing(FitData(DT, growing, y))
+    faster = np.concatenate([u[:2000], 1.8 + 1.8 * np.sin(2.0 * np.pi * 4.0 * DT * np.arange(2000))])
+    assert not RateDependence().missing(FitData(DT, faster, y))
 
 
 def test_a_ring_down_at_the_start_is_left_out_and_an_equal_one_later_is_not() -> None:
