@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim.fitting.fit_data import FitData
@@ -260,7 +260,7 @@ def recording_defects(
     if doubles.count:
         spread = max(sigma_um, 1e-12)
         chance = doubles.of * min(1.0, step_um / (2.0 * spread * math.sqrt(math.pi))) * math.exp(-16.0)
-        p = float(stats.poisson.sf(doubles.count - 1, max(chance, 1e-12)))
+        p = float(special.pdtrc(doubles.count - 1, max(chance, 1e-12)))
         out.append(
             Defect(
                 "repeats",
