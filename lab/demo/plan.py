@@ -3,12 +3,12 @@
 Time line of one run (ticks of ``dt_s``)::
 
     block j covers the ticks [jB, (j+1)B); it is computed when the stage has published tick jB - lead - 1,
-    by the newest model that has seen no sample after jB - lead - margin.
+    by the newest model that has seen no sample after jB - lead - margin - 1, the last one of a block.
 
 The controller follows the model and evaluates it itself. The margin gives the samples time to be learnt, and the model
-time to arrive, so that a run in real time and a fast one use the same models and get the same voltages. Each block also
-commands the ``reserve`` ticks after it: where the controller stalls, the stage goes on along the reference by a model
-that is as much older.
+time to arrive, so that a run in real time and a fast one use models of the same samples; the kernel part that is
+followed in real time is up to 0.2 s older. Each block also commands the ``reserve`` ticks after it: where the
+controller stalls, the stage goes on along the reference by a model that is as much older.
 
 That is with ``strict``. Otherwise stage and controller wait for each other, up to ``LOCK_STEP_S``: a busy machine makes
 the run longer, not its voltages late, and a reserve is not needed.
@@ -115,7 +115,7 @@ class Plan:
     def as_of(self, block: int) -> int:
         """Last sequence number that the answer for ``block`` may have learnt from. -1: none, and the newest snapshot
         answers, which has learnt nothing only before the first sample."""
-        return max(-1, block * self.block - self.lead - self.margin)
+        return max(-1, block * self.block - self.lead - self.margin - 1)
 
     def phases(self) -> dict[str, slice]:
         """The parts of the run in the table, as tick ranges."""

@@ -94,7 +94,12 @@ class Moves:
         model, now = served.models.get(self._learn), learner.moving()
         if now is None or not _is_newest(model, now):
             return
-        near = base is not None and abs(served.seq - base.seq) < self._base_every and now.kernel is self._kernel
+        # By the numbers of the samples, so that a run that is repeated, or fast, has the same bases.
+        near = (
+            base is not None
+            and served.seq // self._base_every == base.seq // self._base_every
+            and now.kernel is self._kernel
+        )
         if base is not None and near and same_choice(base, served):
             self.base = base
         else:

@@ -146,7 +146,8 @@ def test_strict_keeps_real_time_and_counts_what_is_late(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.alone
 def test_fast_gives_the_same_numbers_as_real_time(fast: Path, live: tuple[Path, str]) -> None:
-    """To the last bit, wherever every voltage came in time."""
+    """To some percent of the error, where every voltage came in time: the kernel part that is followed in real time is up
+    to 0.2 s older."""
     quick, real = summary(fast), summary(live[0])
     followed = real["followed"]
     stalls = {name: followed[name] for name in ("extrapolated", "late_models", "lost")}
@@ -156,9 +157,9 @@ def test_fast_gives_the_same_numbers_as_real_time(fast: Path, live: tuple[Path, 
     for name in MODELS:
         for phase, figures in quick["models"][name].items():
             for key, value in figures.items():
-                assert real["models"][name][phase][key] == value, (name, phase, key)
+                assert real["models"][name][phase][key] == pytest.approx(value, rel=0.1, abs=1e-3), (name, phase, key)
     a, b = (pq.read_table(out / "recording").to_pydict() for out in (fast, live[0]))  # type: ignore[no-untyped-call]
-    assert np.array_equal(a["u_V"], b["u_V"])
+    assert np.abs(np.subtract(a["u_V"], b["u_V"])).max() < 0.005 * np.ptp(a["u_V"])
 
 
 @pytest.mark.e2e
