@@ -146,8 +146,7 @@ def test_strict_keeps_real_time_and_counts_what_is_late(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.alone
 def test_fast_gives_the_same_numbers_as_real_time(fast: Path, live: tuple[Path, str]) -> None:
-    """To some percent of the error, where every voltage came in time: the kernel part that is followed in real time is up
-    to 0.2 s older."""
+    """To some percent of the error: the kernel part that is followed in real time is up to 0.2 s older."""
     quick, real = summary(fast), summary(live[0])
     followed = real["followed"]
     stalls = {name: followed[name] for name in ("extrapolated", "late_models", "lost")}
