@@ -73,9 +73,11 @@ class DeltaStreams:
             if stream.base is None:
                 continue
             if base is not None and self._moves(stream, base):
-                for move in moves:
+                # Of an earlier base, another contestant than the learner may be the champion.
+                moving = [move for move in moves if self._moves(stream, move.base)]
+                for move in moving:
                     self._send_move(stream, move, now_s)
-                if not moves:
+                if not moving:
                     self._send_whole(stream, base, now_s)
             elif stream.moved or now_s - stream.sent_at_s >= _PAUSE_S or not same_choice(newest, stream.base):
                 self._send_whole(stream, newest, now_s)
