@@ -178,9 +178,9 @@ class Intake:
         return "" if self._trial is None else self._trial.why
 
     @property
-    def distrusted_s(self) -> float:
-        """For how long the readings have been on trial, s; 0 while they are not."""
-        return 0.0 if self._trial is None else self._trial.since * self.dt_s
+    def on_trial(self) -> bool:
+        """Whether readings have come that are on trial."""
+        return self._trial is not None and self._trial.since > 0
 
     # ---- what a sample is
 

@@ -618,7 +618,7 @@ class Learner:
     @property
     def distrusts(self) -> bool:
         """Whether the readings are on trial: what is served is from before them."""
-        return self.parts.intake.distrusted_s > 0.0
+        return self.parts.intake.on_trial
 
     @property
     def why(self) -> str:

@@ -18,10 +18,10 @@ import numpy as np
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.query import Pending
 
-#: Largest difference, as a share of the voltage range, whatever a converter rounds and a voltage that is read back
-#: varies by; and the least.
+#: Largest and least tolerance for the difference from the commanded voltage, as shares of the voltage range. A
+#: converter rounds, and a voltage that is read back has noise.
 TOLERANCE, LEAST_TOLERANCE = 0.01, 1e-4
-#: Between the two it is so many standard deviations of the differences so far, over so many samples.
+#: Within these limits the tolerance is ``_SIGMA`` standard deviations of the differences in some ``_OVER`` samples.
 _SIGMA: Final = 5.0
 _OVER: Final = 500
 #: The voltage of a sample may be that of a neighbour: sender and stage count the instant of a voltage differently.
