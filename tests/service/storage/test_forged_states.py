@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.forged_states import DT_S, Victims, make_axis, recording
+from benchmarks.forged_states import DT_S, make_axis, recording
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
@@ -96,13 +96,6 @@ def test_no_state_of_an_axis_with_faulty_samples_is_refused(alone: bool) -> None
                 axis.handle(batch)
         other.restore(through_a_file(axis.state_dict()))
         assert other.handled_seq == axis.handled_seq
-
-
-def test_the_states_that_are_forged_are_taken_as_they_are() -> None:
-    victims = Victims()
-    for alone, state in victims.states.values():
-        assert victims.take(alone, state, over_wire=False) == "taken"
-        assert victims.take(alone, state, over_wire=True) == "taken"
 
 
 @pytest.mark.parametrize(
