@@ -102,8 +102,8 @@ def test_decoding_bad_payloads_keeps_no_memory() -> None:
         rss: int = process.memory_info().rss
         return rss
 
-    settled = rounds(3)
-    assert rounds(10) - settled < 8 * 2**20
+    settled = rounds(2)
+    assert rounds(3) - settled < 2 * 2**20
 
 
 @pytest.mark.e2e
