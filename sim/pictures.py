@@ -1,7 +1,6 @@
 """The pictures of causes as curves: the residual without it and with it, over the variable that shows it best.
 
-Curves are numbers here, drawn as PNG by `service.reports.diagnosis` and for the viewer by
-`service.reports.diagnosis_viewer`.
+Curves are numbers here; `service.reports.diagnosis` draws them as PNG.
 """
 
 from __future__ import annotations

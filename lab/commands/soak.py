@@ -13,13 +13,13 @@ from dehyst.service.cli.options import add_epilog, add_shared, check_seed, progr
 
 EPILOG = """\
 In real time the soak runs these processes on loopback: a router, two services (one a hot standby), a simulated stage, a
-controller, a second client that measures, and the viewer's stream. --fast runs the faults of samples in one process.
+controller, a second client that measures, and the viewer's stream.
 Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results at the end: soak.json with the verdict, report.md, soak.png, and
 plan.json with every fault as it happened. Times are judged as they were measured: leave the machine to the soak.
 
   dehyst soak --duration 5m
   dehyst soak --duration 40s --faults kill_primary,nan,gap --out out/short
-  dehyst soak --duration 2h --fast --seed 7
+  dehyst soak --duration 2h --seed 7
 """
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 LEAST_S, MOST_S = 15.0, 90 * 86400.0
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         seed={"default": 1, "help": "seed of the plan, the reference and the stage's noise (%(default)s)"},
         out={"default": Path("out/soak"), "help": "folder for the results (%(default)s)"},
     )
-    add("--fast", action="store_true", help="one process, as fast as possible; faults of processes are left out")
+    add("--fast", action="store_true", help=argparse.SUPPRESS)
     add("--faults", default="", metavar="A,B", help="only these kinds, or none (all; --list prints them)")
     add("--list", action="store_true", help="list the kinds of faults, and exit")
     add_shared(
@@ -53,14 +53,14 @@ def run(args: argparse.Namespace) -> int:
 
     if args.list:
         for name, kind in FAULT_KINDS.items():
-            print(f"{name:<16}{kind.what}{'' if kind.fast else ' (not with --fast)'}")
+            print(f"{name:<16}{kind.what}")
         return 0
+    if args.fast:
+        raise InputError("--fast: replaced by `dehyst rehearse`, which runs faults of samples in lockstep")
     duration_s = seconds(args.duration)
     check_seed(args.seed)
     say = progress_printer(args.quiet)
     kinds = select_kinds([name.strip() for name in args.faults.split(",") if name.strip()])
-    if args.fast:
-        kinds = tuple(name for name in kinds if FAULT_KINDS[name].fast)
     stop = StopSignal()
     from dehyst.lab.soak import session as soak
     from dehyst.lab.soak.report import HELD, verdict_line
@@ -68,7 +68,6 @@ def run(args: argparse.Namespace) -> int:
     done = soak.run(
         args.out,
         make_plan(duration_s, args.seed, kinds),
-        fast=args.fast,
         stage_file=args.stage,
         stopped=lambda: bool(stop.reason),
         say=say,

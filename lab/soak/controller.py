@@ -12,7 +12,7 @@ import math
 import sys
 import threading
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,18 +31,13 @@ from dehyst.service.runtime.stopping import StopSignal
 from dehyst.service.security.authenticator import own_authenticator
 from dehyst.service.security.lease import CommandLease
 from dehyst.service.stage_node.node import status_key
-from dehyst.sim.signals.references import BLEND_S, DemoReference, Motion, Reference, Sequenced, Tones, blended
+from dehyst.sim.signals.references import BLEND_S, DemoReference, Sequenced, Tones
 from dehyst.sim.signals.voltages import sample_times
 
 # --- The task of the soak's controller: keys, limits, and the reference.
 
 STAGE, AXIS = "soak", "x"
 SERVED = "lssvm_adaptive"
-
-
-def dwell_key() -> str:
-    """Key on which the controller is told to hold the reference: JSON {"first": tick, "ticks": n}."""
-    return f"{Keys(STAGE, AXIS).base}/soak_dwell"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,38 +83,22 @@ PERIOD_S = 120.0
 
 @dataclass
 class SoakReference:
-    """A periodic reference: rows y µm, v µm/s, a µm/s² by tick. Each period begins and ends at rest at ``low_um``.
-
-    ``dwells`` are pairs (first tick, ticks) during which the reference rests at mid-range, blends included.
-    """
+    """A periodic reference by tick. Each period begins and ends at rest at ``low_um``."""
 
     dt_s: float
     low_um: float
     high_um: float
     seed: int
-    dwells: list[tuple[int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         moving = DemoReference(PERIOD_S, self.low_um, self.high_um, self.seed)
         period = Sequenced(((PERIOD_S - 2.0 * BLEND_S, moving), (PERIOD_S, Tones(self.low_um))))
-        self._motion = _rows(period.at(sample_times(PERIOD_S, self.dt_s)))
-
-    def at(self, t_s: FloatArray) -> Reference:
-        """The periodic motion at the times ``t_s`` (n,) s of ticks, without dwells."""
-        k = np.rint(t_s / self.dt_s).astype(np.int64)
-        return Reference(t_s, *self._motion[:, k % self._motion.shape[1]])
+        motion = period.at(sample_times(PERIOD_S, self.dt_s))
+        self._motion = np.stack((motion.y_um, motion.v_um_per_s, motion.a_um_per_s2))
 
     def rows(self, first: int, n: int) -> FloatArray:
-        """(3, n) from tick ``first`` on."""
-        parts: list[tuple[float, Motion]] = []
-        for start, ticks in self.dwells:
-            parts.append((start * self.dt_s + 0.5 * BLEND_S, self))
-            parts.append(((start + ticks) * self.dt_s - 0.5 * BLEND_S, Tones(0.5 * (self.low_um + self.high_um))))
-        return _rows(blended(np.arange(first, first + n, dtype=np.float64) * self.dt_s, [*parts, (math.inf, self)]))
-
-
-def _rows(reference: Reference) -> FloatArray:
-    return np.stack((reference.y_um, reference.v_um_per_s, reference.a_um_per_s2))
+        """(3, n) y µm, v µm/s, a µm/s² from tick ``first`` on."""
+        return self._motion[:, np.arange(first, first + n) % self._motion.shape[1]]
 
 
 #: Timeout of a query, s. The controller asks 60 ms ahead, so it does not wait longer.
@@ -191,14 +170,9 @@ class Controller:
         self.counts = {"blocks": 0, "given_up": 0, "retries": 0, "errors": 0, "unsafe": 0}
         self._client = client
         self._session = session
-        self._dwells = session.declare_subscriber(dwell_key(), self._dwell)
         self._commands = CommandLease(session, Keys(STAGE, AXIS), own_authenticator())
         self._last_V = math.nan
         self._error = ""
-
-    def _dwell(self, sample: zenoh.Sample) -> None:
-        dwell = json.loads(sample.payload.to_bytes())
-        self.reference.dwells = [*self.reference.dwells[-8:], (int(dwell["first"]), int(dwell["ticks"]))]
 
     def run(self, stop: StopSignal) -> None:
         """Follow the stage's clock until stopped."""
@@ -227,7 +201,6 @@ class Controller:
                 begin += size
         finally:
             clock.close()
-            self._dwells.undeclare()  # type: ignore[no-untyped-call]
             self._commands.undeclare()
 
     def _block(self, first: int, begin: int, after: Trajectory | None, clock: StageClock) -> Trajectory | None:

@@ -13,8 +13,8 @@ from dehyst.adaptive.errors import InputError
 
 # --- Kinds of faults
 
-#: What a fault acts on: a process, the stage's samples, the reference, or the machine.
-PROCESS, STAGE, REFERENCE, MACHINE = "process", "stage", "reference", "machine"
+#: What a fault acts on: a process, the stage's samples, or the machine.
+PROCESS, STAGE, MACHINE = "process", "stage", "machine"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,6 @@ class FaultKind:
     recover_s : within this time after its end, s, queries must be answered and tracking must be good again.
     silent_s : longest time without an answer that it may cause, s.
     ends_service : whether it ends a service. Such faults come early, so that memory can be measured after them.
-    fast : whether it can be applied in a run in one process.
     sensor : whether the readings are wrong without being impossible: it must have a name within half a second of
         motion, and the error must stay small.
     """
@@ -39,7 +38,6 @@ class FaultKind:
     recover_s: float
     silent_s: float = 0.0
     ends_service: bool = False
-    fast: bool = False
     sensor: bool = False
 
 
@@ -54,32 +52,22 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
     "clock_back": FaultKind("the wall clock of the service set back by an hour", MACHINE, (2.0, 4.0), 3.0),
     "disk_full": FaultKind("no more bytes for the recordings", MACHINE, (3.0, 5.0), 10.0),
     "cpu_stolen": FaultKind("a busy process for each core", MACHINE, (1.5, 3.0), 4.0, 0.5),
-    "bad_queries": FaultKind("malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0),
-    "forged_state": FaultKind(
-        "a stranger answers standbys with forged states, and asks for it", PROCESS, (3.0, 4.0), 6.0
-    ),
-    "rogue_claim": FaultKind("a stranger that claims to serve", PROCESS, (3.0, 4.0), 3.0),
-    "folder_removed": FaultKind("the folders of recording and checkpoints are taken away", MACHINE, (3.0, 3.5), 12.0),
-    "freeze_restart": FaultKind(
-        "freeze, kill -9, a step of the readings, thaw", PROCESS, (10.0, 10.0), 10.0, 0.2, True
-    ),
-    "gap": FaultKind("samples that never come", STAGE, (0.3, 2.0), 5.0, fast=True),
-    "duplicate": FaultKind("every sample twice", STAGE, (0.5, 2.0), 3.0, fast=True),
-    "reorder": FaultKind("messages in the wrong order", STAGE, (0.5, 2.0), 3.0, fast=True),
-    "nan": FaultKind("readings that are not numbers", STAGE, (0.5, 2.0), 5.0, fast=True),
-    "spike": FaultKind("every 25th reading off by 30 µm", STAGE, (0.5, 2.0), 5.0, fast=True),
-    "freeze": FaultKind("a sensor that repeats its last reading", STAGE, (0.5, 2.0), 8.0, fast=True),
-    "saturate": FaultKind("a sensor that ends half way", STAGE, (0.5, 2.0), 8.0, fast=True),
-    "stuck_noisy": FaultKind("a sensor stuck, with 1 pm of noise", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
-    "sensor_gain": FaultKind("a sensor that shows a multiple", STAGE, (2.0, 5.0), 2.0, fast=True, sensor=True),
-    "sign": FaultKind("a sensor with the other sign", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
-    "other_stage": FaultKind("the readings of another stage", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
-    "seq_jump": FaultKind("one sample with a number far ahead", STAGE, (0.5, 0.5), 2.0, fast=True),
-    "losses": FaultKind("19 of 20 samples lost, at random", STAGE, (1.5, 4.0), 3.0, fast=True),
-    "stage_clock": FaultKind("the stage's clock set back by an hour", STAGE, (1.0, 2.0), 5.0, fast=True),
-    "gain": FaultKind("the stage's gain changes by some percent, for good", STAGE, (0.0, 0.0), 12.0, fast=True),
-    "payload": FaultKind("the moved mass doubles, or halves again", STAGE, (0.0, 0.0), 10.0, fast=True),
-    "dwell": FaultKind("the reference rests", REFERENCE, (2.0, 4.0), 4.0, fast=True),
+    "gap": FaultKind("samples that never come", STAGE, (0.3, 2.0), 5.0),
+    "duplicate": FaultKind("every sample twice", STAGE, (0.5, 2.0), 3.0),
+    "reorder": FaultKind("messages in the wrong order", STAGE, (0.5, 2.0), 3.0),
+    "nan": FaultKind("readings that are not numbers", STAGE, (0.5, 2.0), 5.0),
+    "spike": FaultKind("every 25th reading off by 30 µm", STAGE, (0.5, 2.0), 5.0),
+    "freeze": FaultKind("a sensor that repeats its last reading", STAGE, (0.5, 2.0), 8.0),
+    "saturate": FaultKind("a sensor that ends half way", STAGE, (0.5, 2.0), 8.0),
+    "stuck_noisy": FaultKind("a sensor stuck, with 1 pm of noise", STAGE, (2.0, 4.0), 2.0, sensor=True),
+    "sensor_gain": FaultKind("a sensor that shows a multiple", STAGE, (2.0, 5.0), 2.0, sensor=True),
+    "sign": FaultKind("a sensor with the other sign", STAGE, (2.0, 4.0), 2.0, sensor=True),
+    "other_stage": FaultKind("the readings of another stage", STAGE, (2.0, 4.0), 2.0, sensor=True),
+    "seq_jump": FaultKind("one sample with a number far ahead", STAGE, (0.5, 0.5), 2.0),
+    "losses": FaultKind("19 of 20 samples lost, at random", STAGE, (1.5, 4.0), 3.0),
+    "stage_clock": FaultKind("the stage's clock set back by an hour", STAGE, (1.0, 2.0), 5.0),
+    "gain": FaultKind("the stage's gain changes by some percent, for good", STAGE, (0.0, 0.0), 12.0),
+    "payload": FaultKind("the moved mass doubles, or halves again", STAGE, (0.0, 0.0), 10.0),
 }
 
 

@@ -89,7 +89,7 @@ def assess(observed: Observations) -> None:
         silent = [p.silent_s for p in between(observed.probes, begin, min(until + 1.0, next_s))]
         fault.silent_s = max(silent, default=0.0)
         for second in range(math.ceil(end), math.floor(until) + 1):
-            if second in well and (observed.fast or second in answered):
+            if second in well and second in answered:
                 fault.recovered_s = float(second)
                 break
         fault.told = told_by(observed, fault, until)
@@ -142,13 +142,10 @@ WARM_UP_S, COMPARED_S = 180.0, 300.0
 _BLOCK_BYTES: Final = 100.0
 #: Samples that may be on their way when two counters are read: a message or two.
 UNDER_WAY = 64
-#: In these faults commands may reach neither the monitor nor the stage.
-_UNSEEN: Final = ("restart_router",)
 
 
-def judge(observed: Observations, missing: int | None, tracking_pct: float = TRACKING_PCT) -> dict[str, Invariant]:
-    """Judge all invariants, after `assess`. ``missing``: samples that were seen and are in no recording; None if there
-    are no recordings."""
+def judge(observed: Observations, missing: int, tracking_pct: float = TRACKING_PCT) -> dict[str, Invariant]:
+    """Judge all invariants, after `assess`. ``missing``: samples that were seen and are in no recording."""
     seconds, faults, probes = observed.seconds, observed.faults, observed.probes
     found = {
         "voltages_finite": _at_most(
@@ -160,7 +157,7 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
             "voltage beyond its limits, as sent or as applied",
         ),
         "voltages_within_slew": _at_most(
-            _worst_step(observed), ROUND_OFF, "limits",
+            max((s.step_V for s in seconds), default=0.0) / observed.step_limit_V, ROUND_OFF, "limits",
             "largest step of the voltage, as sent or as applied, over what the slew limit allows",
         ),
         "answers_safe": _at_most(
@@ -168,8 +165,7 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
             "answers that were not finite, beyond a limit or too steep",
         ),
     }  # fmt: skip
-    if not observed.fast:
-        found |= _times(observed)
+    found |= _times(observed)
     found["recovers_by_itself"] = _recovers(observed)
     found["faults_happened"] = _at_most(
         int(bool(observed.planned) and not faults), 0, "runs", "runs with a plan of which not one fault began"
@@ -183,21 +179,10 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
     )
     found["samples_accounted"] = _samples_accounted(observed.counters)
     found["processes_alive"] = _at_most(len(observed.ended), 0, "processes", "processes that ended by themselves")
-    if missing is not None:
-        found["no_record_lost"] = _at_most(missing, 0, "samples", "samples that came and are in nobody's recording")
+    found["no_record_lost"] = _at_most(missing, 0, "samples", "samples that came and are in nobody's recording")
     found["tracking"] = _tracking(observed, tracking_pct)
     found["memory"] = _memory(observed)
     return found
-
-
-def _worst_step(observed: Observations) -> float:
-    """Largest step as a share of what the slew limit allows."""
-    unseen = [fault.window_s for fault in observed.faults if fault.kind in _UNSEEN]
-    worst_V = 0.0
-    for s in observed.seconds:
-        judged = not any(begin - 1.0 <= s.t_s <= end for begin, end in unseen)
-        worst_V = max(worst_V, s.step_V, s.resumed_V if judged else 0.0)
-    return worst_V / observed.step_limit_V
 
 
 def _times(observed: Observations) -> dict[str, Invariant]:
@@ -261,9 +246,8 @@ def _memory(observed: Observations) -> Invariant:
             first, last = t_s <= t_s[0] + COMPARED_S, t_s >= t_s[-1] - COMPARED_S
             grown = float(np.median(mb[last]) - np.median(mb[first]))
             worst = grown if worst is None else max(worst, grown)
-    why = "in one process" if observed.fast else "too short a run"
     text = f"growth of what a service has in use, its last {COMPARED_S / 60:g} min above the first after warm-up"
-    return _at_most(worst, MEMORY_MB, "MB", text, why)
+    return _at_most(worst, MEMORY_MB, "MB", text, "too short a run")
 
 
 def memory_in_use(observed: Observations) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -104,8 +104,6 @@ class _Watch:
         """End a fault; returns when, s."""
         self._actions.end()
         record.end_s = self._monitor.now()
-        record.breaches += self._actions.breaches
-        record.unjudged += self._actions.unjudged
         if FAULT_KINDS[record.kind].sensor:
             track, gain = self._monitor.track, stage_gain(self._observed.faults, record.begin_s)
             judge_sensor_fault(record, track, self._monitor.troubles(record.begin_seq), track.newest, gain)

@@ -97,8 +97,7 @@ MOVES_PER_S: Final = 0.02
 class SampleSecond:
     """One second of samples: counts, the sum and maximum of |error| in µm, and the worst voltages, sent or applied.
 
-    ``held`` samples had no command in time: the stage held the last voltage. ``resumed_V`` is the step at the beginning
-    of a block whose predecessor was not seen.
+    ``held`` samples had no command in time: the stage held the last voltage.
     """
 
     t_s: float
@@ -111,7 +110,6 @@ class SampleSecond:
     beyond_V: float = 0.0
     held: int = 0
     not_finite: int = 0
-    resumed_V: float = 0.0
 
     @property
     def mae_um(self) -> float:
@@ -134,9 +132,8 @@ class SampleTracker:
     def __post_init__(self) -> None:
         self._wanted, self._error_um, self._commanded_V = np.full((3, _RING), np.nan)
         self._wanted_seq, self._commanded_seq = np.full((2, _RING), -1, dtype=np.int64)
-        #: The last voltage applied, and the last one sent, each with the number of its sample.
+        #: The last voltage applied, with the number of its sample.
         self._applied_V, self._applied_seq = math.nan, -2
-        self._sent_V, self._sent_seq = math.nan, -2
         self.newest = -1
         self.received = 0
 
@@ -150,8 +147,7 @@ class SampleTracker:
     def command(self, first: int, u_V: FloatArray) -> None:
         """Add voltages sent for the samples from ``first`` on, V, as they were sent, before any limit of the stage.
 
-        The first one is compared with what was last sent for the sample before it, also if a block replaces another. A
-        stage without a command holds its last voltage: after blocks that were given up, a block begins there.
+        The first one is compared with what was last sent for the sample before it, also if a block replaces another.
         """
         second = self._second()
         self._check(second, u_V)
@@ -160,13 +156,9 @@ class SampleTracker:
         with np.errstate(invalid="ignore"):
             steps = np.abs(np.diff(u_V, prepend=before_V))
         second.step_V = max(second.step_V, float(np.max(steps, initial=0.0, where=np.isfinite(steps))))
-        if math.isnan(before_V) and 0 < first - self._sent_seq < RESTART_GAP:
-            second.resumed_V = float(np.fmax(second.resumed_V, abs(u_V[0] - self._sent_V)))
         numbers = np.arange(first, first + u_V.size)
         self._commanded_V[numbers % _RING] = u_V
         self._commanded_seq[numbers % _RING] = numbers
-        if not 0 < self._sent_seq - int(numbers[-1]) < RESTART_GAP:
-            self._sent_V, self._sent_seq = float(u_V[-1]), int(numbers[-1])
 
     def refuse_command(self) -> None:
         """Count a command that could not be decoded."""
@@ -299,8 +291,8 @@ class QuerySecond:
         return cls(t_s, trips_us, ages_s, line["failed"], line["unsafe"], line["silent_s"])
 
 
-#: What reports a fault: counters of the status, of which one must grow (with a "+": all of them in one service),
-#: ``event`` for any event, ``event NAME``, ``trouble`` for any trouble, ``instance`` for another instance that answers.
+#: What reports a fault: counters of the status, of which one must grow, ``event`` for any event, ``trouble`` for any
+#: trouble, ``instance`` for another instance that answers.
 #: A kind that is missing here need not be reported.
 INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     "kill_primary": ("instance", "event"),
@@ -309,7 +301,6 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     "restart_stage": ("samples.restarts",),
     "restart_router": ("samples.lost", "event"),
     "disk_full": ("recorder.errors", "recorder.lost", "event"),
-    "bad_queries": ("queries.errors+samples.malformed",),
     "gap": ("samples.lost",),
     "duplicate": ("samples.late",),
     "reorder": ("samples.late",),
@@ -322,12 +313,7 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys(("stuck_noisy", "sensor_gain", "sign", "other_stage"), ("trouble",)),
     "seq_jump": ("samples.gates.ahead",),
     "losses": ("samples.lost",),
-    "forged_state": ("peers.states_refused",),
-    "rogue_claim": ("peers.claims_refused",),
-    "folder_removed": ("recorder.errors",),
-    "freeze_restart": ("event frozen",),
     "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
-    "dwell": ("samples.gates.unexcited",),
 }  # fmt: skip
 #: Counters that add up to the numbers handled, with their signs.
 NUMBERS: Final = {
@@ -336,7 +322,7 @@ NUMBERS: Final = {
 }  # fmt: skip
 #: The numbers of a status that are kept.
 _KEPT: Final = tuple(
-    {name: 0 for told in INDICATORS.values() for names in told for name in names.split("+") if "." in name}
+    {name: 0 for told in INDICATORS.values() for name in told if "." in name}
     | NUMBERS
     | dict.fromkeys(("samples.restarts", "seq", "memory.malloc_bytes", "memory.python_blocks", "verdicts", "serves"))
 )
@@ -375,14 +361,13 @@ class Observations:
 
     Attributes
     ----------
-    fast : whether it ran in one process. planned : number of faults in the plan.
+    planned : number of faults in the plan.
     seconds, probes : of the stage's samples, and of the prober. counters : per service and second.
     ended : (t_s, process) that ended without a fault. unsafe_blocks : answers to the controller that broke a promise.
     """
 
     range_um: float
     step_limit_V: float
-    fast: bool = False
     planned: int = 0
     duration_s: float = 0.0
     faults: list[FaultRecord] = field(default_factory=list)
@@ -440,8 +425,6 @@ def told_by(observed: Observations, fault: FaultRecord, until_s: float) -> str:
             found = next((f"event {e['event']}" for e in events if e["event"] not in alive), "")
         elif indicator == "trouble":
             found = next((f"trouble {_trouble(e)}" for e in events if e["event"] == "trouble"), "")
-        elif indicator.startswith("event "):
-            found = indicator if any(e["event"] == indicator[6:] for e in events) else ""
         elif indicator == "instance":
             before = {row.instance for row in rows if begin - 5.0 <= row.t_s <= begin}
             new = {row.instance for row in rows if row.t_s > begin} - before
@@ -450,7 +433,7 @@ def told_by(observed: Observations, fault: FaultRecord, until_s: float) -> str:
         else:
             for instance in {row.instance for row in rows}:
                 mine = [row for row in rows if row.instance == instance]
-                if all(_grew(mine, name, begin) for name in indicator.split("+")):
+                if _grew(mine, indicator, begin):
                     found = indicator
         if found:
             return found

@@ -80,10 +80,9 @@ def write_summary(path: Path, found: Mapping[str, Any]) -> None:
 
 def report(found: Mapping[str, Any], observed: Observations, plan: SoakPlan, interrupted: bool) -> str:
     """The report, from the content of ``soak.json`` and the observations."""
-    how = "in one process, as fast as it goes" if observed.fast else "in real time, in processes"
     lines = [
         f"# Soak: {verdict_line(found)}", "",
-        f"{found['duration_s']:g} s of {plan.duration_s:g} s {how}; seed {plan.seed}; {len(observed.faults)} of "
+        f"{found['duration_s']:g} s of {plan.duration_s:g} s; seed {plan.seed}; {len(observed.faults)} of "
         f"{len(plan.faults)} planned faults." + (" Interrupted: this is what ran." if interrupted else ""),
         *(["", f"No time was left for: {', '.join(plan.left_out)}."] if plan.left_out else []),
         "", *(f"- {note}" for note in dict.fromkeys(observed.notes)), "", "## What must hold", "",

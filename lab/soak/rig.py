@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import time
 from dataclasses import replace
@@ -27,8 +26,6 @@ SLEW_SHARE_PER_MS: Final = 1.0 / 3.0
 #: number is unique, and the service must notice each restart.
 _STARTS, _NUMBERS_PER_START = 1000, 1_000_000_000
 SERVICES: Final = ("a", "b")
-#: Folders of a service; a standby's have a suffix.
-FOLDERS: Final = ("recording", "checkpoints")
 #: Between the last sample and the end of the services, so that they handle what is under way, s.
 _DRAIN_S: Final = 1.0
 
@@ -133,24 +130,9 @@ class SoakRig:
         options = ["--file", str(path), "--endpoint", self.rig.endpoint, "--inject", "--first", str(first)]
         self.rig.start_stage(STAGE, AXIS, *options, "--slew", repr(self.task.slew_V_per_s), wait=False)
 
-    def start_helper(self, module: str, name: str, what: str, *arguments: str) -> Child:
-        """Start a process of this package's ``module`` and wait until it is ready."""
-        return self.rig.start(name, ["-m", f"dehyst.lab.soak.{module}", what, self.rig.endpoint, *arguments])
-
-    def take_folders_away(self, name: str, now_s: float) -> list[Path]:
-        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where the first
-        were.
-
-        What was recorded must still be counted at the end; checkpoints of hours would fill the disk.
-        """
-        away = self._out / name / f"taken-{now_s:.0f}"
-        away.mkdir()
-        recordings, checkpoints = (sorted((self._out / name).glob(f"{what}*")) for what in FOLDERS)
-        for path in recordings:
-            path.rename(away / path.name)
-        for path in checkpoints:
-            shutil.rmtree(path, ignore_errors=True)
-        return recordings
+    def start_disturber(self, name: str, what: str) -> Child:
+        """Start a process of `lab.soak.disturbers` and wait until it is ready."""
+        return self.rig.start(name, ["-m", "dehyst.lab.soak.disturbers", what, self.rig.endpoint])
 
     def service_of(self, instance: str) -> str:
         """Name of the service with this instance id, which contains its process id; "" if there is none."""

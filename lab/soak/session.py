@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from dehyst.lab.soak.fast import run_fast
 from dehyst.lab.soak.fault_plan import SoakPlan
 from dehyst.lab.soak.judge import TRACKING_PCT, assess, judge, mean_error_pct, recorded, unrecordable
 from dehyst.lab.soak.live import Say, run_live
@@ -31,9 +30,7 @@ class Done:
     interrupted: bool
 
 
-def run(
-    out: Path, plan: SoakPlan, *, fast: bool, stage_file: Path | None, stopped: Callable[[], bool], say: Say
-) -> Done:
+def run(out: Path, plan: SoakPlan, *, stage_file: Path | None, stopped: Callable[[], bool], say: Say) -> Done:
     """Run the plan and write the results into ``out``. ``stage_file``: a stage in place of the default one.
 
     Raises InputError on a folder or a stage that cannot be used, ServiceError if a process does not start.
@@ -43,17 +40,12 @@ def run(
     stage = stage_config(stage_file, plan.seed)
     say(f"[1/3] identifying stage {stage.name!r} from 10 s of the chapter's signal")
     control = identify(stage, out / "model.npz", plan.seed)
-    where = "in one process, as fast as it goes" if fast else "in real time, in processes over zenoh"
-    say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, {where}")
+    say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, in real time, in processes over zenoh")
     if plan.left_out:
         say(f"      no time for: {', '.join(plan.left_out)}")
     step_V = control.slew_V_per_s * control.dt_s
-    observed = Observations(control.range_um, step_V, fast, planned=len(plan.faults))
-    missing: int | None = None
-    if fast:
-        samples = run_fast(out, stage, control, plan, observed, stopped, say)
-    else:
-        missing, samples = _kept(out, observed, run_live(out, stage, control, plan, observed, stopped, say))
+    observed = Observations(control.range_um, step_V, planned=len(plan.faults))
+    missing, samples = _kept(out, observed, run_live(out, stage, control, plan, observed, stopped, say))
     say("[3/3] judging and drawing")
     assess(observed)
     limit_pct = TRACKING_PCT if stage_file is None else _own_limit_pct(observed)

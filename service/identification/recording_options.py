@@ -17,8 +17,8 @@ from dehyst.sim.recordings.columns import QUANTITIES, MissingError
 READING = """\
 Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
 options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
-text with or without a header line, .lvm and .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
-(or a folder of a recorder's segments), .feather, and array files of piezo controllers. Examples: docs/recordings.md.
+text with or without a header line, .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
+(or a folder of a recorder's segments), .feather, .json. Examples: docs/recordings.md.
 """
 
 

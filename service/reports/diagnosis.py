@@ -1,4 +1,4 @@
-"""The files of `dehyst diagnose`: report.json, report.md, its pictures, the extended stage, and an ``.rrd``."""
+"""The files of `dehyst diagnose`: report.json, report.md, its pictures, and the extended stage."""
 
 from __future__ import annotations
 
@@ -23,18 +23,15 @@ __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
 _ROLES = {MEASURED: colours.MEASURED, WITHOUT: BEFORE, WITH: AFTER}
 
 
-def write_report(
-    out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool = True, schema: int = SCHEMAS[-1]
-) -> dict[str, Any]:
+def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, schema: int = SCHEMAS[-1]) -> dict[str, Any]:
     """Write all files into the folder ``out`` and return the content of report.json.
 
-    ``rrd``: also ``diagnosis.rrd`` for the Rerun viewer. ``schema``: that of report.json, one of `SCHEMAS`.
-    Raises InputError if the folder cannot be written.
+    ``schema``: that of report.json, one of `SCHEMAS`. Raises InputError if the folder cannot be written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
         # Remove the pictures of an earlier diagnosis in this folder.
-        for old in (*out.glob("[0-9]-*.png"), *out.glob("diagnosis.rrd")):
+        for old in out.glob("[0-9]-*.png"):
             old.unlink()
         data = diagnosis.as_dict(schema)
         (out / "report.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
@@ -43,14 +40,9 @@ def write_report(
         draw_residual(out / "residual.png", diagnosis, f"{source.data}: {diagnosis.verdict}")
         for place, cause in enumerate(diagnosis.causes):
             draw_cause(out / picture_name(place, cause), cause, diagnosis)
-        text = page(diagnosis, exported, source, viewer=rrd)
-        (out / "report.md").write_text(text, encoding="utf-8")
+        (out / "report.md").write_text(page(diagnosis, exported, source), encoding="utf-8")
     except OSError as error:
         raise InputError(f"--out: cannot write into {out}: {error.strerror}; name a folder you may write to") from error
-    if rrd:
-        from dehyst.service.reports.diagnosis_viewer import write_viewer
-
-        write_viewer(out / "diagnosis.rrd", diagnosis, source.data, text)
     return data
 
 

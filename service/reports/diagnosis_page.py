@@ -59,8 +59,8 @@ def picture_name(place: int, cause: NamedCause) -> str:
     return f"{place + 1}-{cause.name}.png"
 
 
-def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewer: bool = True) -> str:
-    """The content of report.md. ``viewer``: diagnosis.rrd is written as well."""
+def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source) -> str:
+    """The content of report.md."""
     d = diagnosis
     lines = [f"# {source.data}: what the simulation lacks", "", *_summary(d, source), ""]
     lines += [*_errors(d), ""]
@@ -77,7 +77,7 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
         "",
         f"Record: {d.next_experiment}." if d.next_experiment else "Nothing is open that another drive would settle.",
         "",
-        _file(d, exported) + (" `diagnosis.rrd` opens in the Rerun viewer." if viewer else ""),
+        _file(d, exported),
         "",
     ]
     findings = (*source.findings, *d.notes, *(defect.words for defect in d.defects))

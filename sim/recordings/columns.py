@@ -1,6 +1,6 @@
 """The meaning of a file's columns: names and units as the user states them, never guessed.
 
-A unit comes from an option, from the file's own entry for the column (TDMS, LVM, HDF5), or from the end of the
+A unit comes from an option, from the file's own entry for the column (TDMS, HDF5), or from the end of the
 column's name (``y_nm``). A column without any of them is refused with the option that adds it.
 """
 

@@ -1,4 +1,4 @@
-"""Delimited text: its encoding, delimiter, decimal sign and preamble are found, and it is read in blocks.
+"""Delimited text: its encoding, delimiter, decimal sign and first row are found, and it is read in blocks.
 
 The first lines of a file decide its layout. The table is read by numpy's compiled reader in one thread: the reader of
 pyarrow starts threads that can abort the process when it ends soon after a refused file.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
-from dehyst.sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
+from dehyst.sim.recordings.columns import ColumnMap, stated_unit
 from dehyst.sim.recordings.table import MAX_BYTES, Table, seconds
 from dehyst.sim.recordings.text_cells import (
     different,
@@ -37,8 +37,6 @@ _HEAD_LINES: Final = 400
 #: The same where these hold a long preamble only.
 _LONG_HEAD_LINES: Final = 20_000
 _BLOCK_ROWS: Final = 200_000
-#: Most lines of text below the samples.
-_MOST_TAIL_LINES: Final = 1000
 #: Delimiters in the order in which they are tried; a blank stands for any number of blanks.
 _DELIMITERS: Final = ("\t", ";", ",", "|", " ")
 _NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", "|": "'|'", " ": "blanks"}
@@ -48,12 +46,6 @@ _MISSING: Final = frozenset({
     "ovrng", "overrange", "over range", "overload", "overflow", "ol", "out of range", "invalid", "error",
     "\N{INFINITY}", "-\N{INFINITY}", "+\N{INFINITY}",
 })  # fmt: skip
-#: Words in front of the units and the sample time in preambles of oscilloscopes, in lower case without a colon.
-_X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit", "hunit")
-_Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit", "vunit")
-_X_STEP: Final = (
-    "sample interval", "xinc", "x increment", "xincrement", "sampling period", "hresolution", "delta t",
-)  # fmt: skip
 #: A time of day, also behind a date in any order of day, month and year, which only a midnight would need.
 _TIME_OF_DAY: Final = re.compile(
     r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,:]\d*)?)(?: ?([AaPp])[Mm])?"
@@ -69,8 +61,6 @@ _SEPARATORS: Final = {
     ".": "points", ",": "commas", "'": "apostrophes", "\u2019": "apostrophes", "\u00a0": "blanks",
     "\u202f": "blanks", " ": "blanks",
 }  # fmt: skip
-#: A duration as MATLAB writes it into a table.
-_DURATION: Final = re.compile(r"([+-]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?) (sec|min|ms|us)")
 _DATE: Final = re.compile(r"(\d{4}-\d{2}-\d{2}(?:[T ]\d{2}:\d{2}(?::\d{2}(?:\.\d*)?)?)?) ?(?:Z|UTC|[+-]\d{2}:?\d{2})?")
 
 
@@ -83,9 +73,7 @@ class Layout:
     delimiter : between its cells, a blank for any blanks. decimal : "." or ",".
     start : number of lines above the first sample. width : cells in a row.
     columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
-    units : name -> unit, where the file states it apart from the name.
-    dt_s : sample time that the preamble states, s, or None. notes : what was found, for people.
-    heads : lines of names and units, without blanks, which may come again between the rows.
+    units : name -> unit, where a row below the names states it. notes : what was found, for people.
     """
 
     delimiter: str
@@ -96,9 +84,7 @@ class Layout:
     names: tuple[str, ...]
     kinds: str
     units: dict[str, str] = field(default_factory=dict)
-    dt_s: float | None = None
     notes: tuple[str, ...] = ()
-    heads: frozenset[str] = frozenset()
 
 
 def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
@@ -205,7 +191,7 @@ def _kind(cell: str, decimal: str, grouped: bool = False) -> str:
         return "e"
     if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _grouped(cell, decimal, grouped):
         return "n"
-    return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY, _DURATION)) else "t"
+    return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY)) else "t"
 
 
 def _grouped(cell: str, decimal: str, known: bool) -> bool:
@@ -301,18 +287,11 @@ def _layout(
         units = {} if below is None else units_row(names, _fit(lines[below], block, columns))
         if units and below is not None:
             notes.append(_units_note(below, units))
-    preamble = _preamble(lines[: max(start, 40)], block.delimiter)
     if names is None:
         names = [str(j + 1) for j in columns]
         notes.append("no names of columns in the file: they are called by their position, from 1")
     kinds = "".join(block.kinds[j] if block.kinds[j] != "e" else "n" for j in columns)
-    over, dt_s = _of_preamble(names, preamble, block.decimal)
-    units = {**over, **units}
     said = _said(encoding, block, mapping, start, above, lines)
-    if over:
-        notes.append("units from the preamble: " + ", ".join(f"{name} in {unit}" for name, unit in over.items()))
-    if dt_s is not None:
-        notes.append(f"the preamble states a sample time of {dt_s:g} s")
     separators = {
         _SEPARATORS[sign]
         for line in lines[start:]
@@ -324,8 +303,7 @@ def _layout(
     if separators:
         notes.append(f"thousands separated by {', '.join(sorted(separators))}")
     return Layout(
-        block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
-        (*said, *notes), frozenset(lines[k].strip() for k in above[-2:]),
+        block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, (*said, *notes)
     )  # fmt: skip
 
 
@@ -363,8 +341,6 @@ def _names_above(
     if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
         # As pandas writes its index: the first column has no name.
         cells[0] = "index"
-    if names := _traces(lines, block, columns, above):
-        return names, {}, [f"columns named by the preamble: {', '.join(names)}"]
     if named := _names_and_units(lines, block, columns, above):
         return named
     if not cells or not all(cells):
@@ -423,48 +399,8 @@ def _names_and_units(
     return None
 
 
-def _traces(lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]) -> list[str] | None:
-    """The names of the columns where a line of the preamble begins with the word ``TraceName``, or Igor's ``WAVES``."""
-    for k in above:
-        cells = _cells_of(lines[k], block.delimiter)
-        word = cells[0].casefold().partition("/")[0] if cells else ""
-        if word in ("tracename", "waves") and len(cells) == len(columns) + 1:
-            return different(cells[1:])
-    return None
-
-
 def _units_note(line: int, units: dict[str, str]) -> str:
     return f"units from line {line + 1}: {', '.join(f'{name} in {unit}' for name, unit in units.items())}"
-
-
-def _preamble(lines: list[str], delimiter: str) -> dict[str, list[str]]:
-    """Word -> the values behind it, of the lines above the samples or in front of the first ones."""
-    found: dict[str, list[str]] = {}
-    for line in lines:
-        cells = split_cells(line.strip("\r\n"), delimiter)
-        word = cells[0].strip(' :"').casefold() if cells else ""
-        if len(cells) > 1 and word and not is_number(word, "."):
-            found.setdefault(word, [cell for cell in cells[1:] if cell])
-    return found
-
-
-def _of_preamble(names: list[str], preamble: dict[str, list[str]], decimal: str) -> tuple[dict[str, str], float | None]:
-    """name -> unit, and the sample time in s where it is stated in s, from the preamble of an oscilloscope."""
-    x = next((preamble[word] for word in _X_UNITS if preamble.get(word)), [])
-    y = next((preamble[word] for word in _Y_UNITS if preamble.get(word)), [])
-    step = next((preamble[word] for word in _X_STEP if preamble.get(word)), [])
-    units: dict[str, str] = {}
-    if "tracename" in preamble and len(y) == len(names):  # channels without a column for the time
-        units = {name: unit for name, unit in zip(names, y, strict=True) if stated_unit(unit)}
-    elif x and len(names) > 1 and stated_unit(x[0]):
-        units[names[0]] = x[0]
-        channels = names[1:]
-        labels = y if len(y) >= len(channels) else y * len(channels) if len(y) == 1 == len(channels) else []
-        units |= {name: unit for name, unit in zip(channels, labels, strict=False) if stated_unit(unit)}
-    dt_s = _number(step[0], decimal) if step and (not x or stated_unit(x[0]) == "s") else None
-    if dt_s is not None and not 0.0 < dt_s < 1e3:
-        dt_s = None
-    return units, dt_s
 
 
 def _said(
@@ -487,9 +423,6 @@ def _said(
 # --- The rows.
 
 
-_REPEATED: Final = "the line of names comes again between the rows: read on"
-
-
 class _Rows:
     """Collects the columns of a file, block by block."""
 
@@ -510,8 +443,6 @@ class _Rows:
         """Take the next lines of the file; ``last`` says that there are no more."""
         numbered = self._line
         self._line += len(lines)
-        if last:
-            lines = self._without_tail(lines)
         block = None if self._texts else self._fast(lines)
         if block is None:
             block = self._slow(lines, numbered, last)
@@ -523,29 +454,6 @@ class _Rows:
             )
         for i, values in zip(self._numbers, block, strict=True):
             self._blocks[i].append(np.ascontiguousarray(values))
-
-    def _without_tail(self, lines: list[str]) -> list[str]:
-        """``lines`` without a text below the samples: an end mark, remarks, a row of means."""
-        stop = len(lines)
-        while stop > max(0, len(lines) - _MOST_TAIL_LINES) and not self._begins_as_row(lines[stop - 1]):
-            stop -= 1
-        tail = [
-            line.strip() for line in lines[stop:] if not _is_comment(line) and line.strip() not in self.layout.heads
-        ]
-        if tail and stop:
-            what = f"the last {len(tail)} lines are" if len(tail) > 1 else "the last line is"
-            self.notes.append(f"{what} no samples and left out: {tail[0][:60]!r}")
-        return lines[:stop] if stop else lines
-
-    def _begins_as_row(self, line: str) -> bool:
-        """Whether a line has a number, or nothing, in the first column of numbers, and times where there are times."""
-        layout = self.layout
-        cells = dict(enumerate(split_cells(line.strip("\r\n"), layout.delimiter))) if line.strip("\x1a \r\n") else {}
-        first = {layout.columns[self._numbers[0]]: "ne"} if self._numbers else {}
-        times = {at: "de" for at, kind in zip(layout.columns, layout.kinds, strict=True) if kind == "d"}
-        return bool(cells) and all(
-            at in cells and _kind(cells[at], layout.decimal, True) in kinds for at, kinds in {**first, **times}.items()
-        )
 
     def _fast(self, lines: list[str]) -> FloatArray | None:
         """(k, n) numbers by the compiled reader; None where a line is not k numbers."""
@@ -575,10 +483,6 @@ class _Rows:
         rows: list[list[str]] = []
         for k, line in enumerate(lines, numbered + 1):
             if _is_comment(line):
-                continue
-            if line.strip() in layout.heads:
-                if _REPEATED not in self.notes:
-                    self.notes.append(_REPEATED)
                 continue
             cells = split_cells(line.strip("\r\n"), layout.delimiter)
             if len(cells) > layout.width and not any(cells[layout.width :]):
@@ -639,9 +543,7 @@ class _Rows:
                 for row, text in self._wrong[i].items():
                     values[row] = text
             found[name] = values
-        return Table(
-            self.source, found, dt_s=layout.dt_s, notes=(*layout.notes, *self.notes), units=units, positional=True
-        )
+        return Table(self.source, found, notes=(*layout.notes, *self.notes), units=units, positional=True)
 
 
 def _number(cell: str, decimal: str) -> float | None:
@@ -666,10 +568,6 @@ def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
             return seconds(np.array([date[1] if date else "NaT" for date in dates], dtype="datetime64[ns]")), True
         except ValueError:
             return np.array(cells), False
-    durations = [_DURATION.fullmatch(cell) for cell in cells]
-    if filled and all(duration for cell, duration in zip(cells, durations, strict=True) if cell):
-        factors = QUANTITIES["t"][1]
-        return np.array([float(d[1]) * factors[stated_unit(d[2]) or "s"] if d else np.nan for d in durations]), True
     if filled and all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
         of_day = np.array(list(_seconds_of_day(cells)))
         # Midnight is no step back.

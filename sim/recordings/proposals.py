@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -127,42 +125,6 @@ def _unit(table: Table, quantity: str, name: str) -> str | None:
     if stated:
         return stated_unit(stated) or stated
     return unit_of_name(quantity, name) or other_unit_of_name(quantity, name)
-
-
-def only_signal(table: Table) -> Candidate | None:
-    """The only array of a table beside its time."""
-    time = likely_time(table)
-    signals = [one for one in candidates(table) if time is None or one.name != time.name]
-    return signals[0] if len(signals) == 1 else None
-
-
-def in_another_file(quantity: str, table: Table, other: Path | None, drives: bool) -> tuple[str, ...]:
-    """The options for a quantity that no array of ``table`` can be: instruments write a file for each channel.
-
-    ``other`` : the file of the other channel, where it is known; ``drives`` : whether it is the voltage's.
-    """
-    one = only_signal(table)
-    if quantity != "y" or one is None:
-        return (f"--file {quantity}=FILE",)
-    file = "FILE" if other is None else shlex.quote(str(other))
-    unit = _unit(table, "y", one.name)
-    # The sensor's file is like that of the voltage: with a unit in volts, or without any.
-    asked = () if unit in QUANTITIES["y"][1] else ("--unit y=UNIT",) if unit is None else ("--scale y=FACTOR",)
-    return (f"--file {'u' if drives else 'y'}={file}", *asked)
-
-
-#: The number of a channel in the name of a file: ``C1--stage``, ``F0001CH1``, ``tek_chan2``.
-_CHANNEL: Final = re.compile(r"(?<![A-Za-z])(ch|chan|channel|c)([ _-]?)(\d+)(?![\dA-Za-z])", re.IGNORECASE)
-
-
-def other_channel(path: Path) -> Path | None:
-    """The only file beside ``path`` that has its name but for the number of the channel; None where there is none."""
-    if len(_CHANNEL.findall(path.name)) != 1:
-        return None
-    plain = _CHANNEL.sub(r"\1\2", path.name)
-    beside = [file for file in path.parent.glob(f"*{path.suffix}") if file != path]
-    found = [file for file in beside if _CHANNEL.sub(r"\1\2", file.name) == plain]
-    return found[0] if len(found) == 1 else None
 
 
 def _changes(values: NDArray[Any]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import hashlib
 import zlib
@@ -17,7 +16,6 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.recordings import array_formats as arrays
 from dehyst.sim.recordings import delimited_text, json_arrays
-from dehyst.sim.recordings import text_formats as text
 from dehyst.sim.recordings.columns import (
     KELVIN_AT_0_C,
     QUANTITIES,
@@ -29,15 +27,7 @@ from dehyst.sim.recordings.columns import (
     factor_and_unit,
     is_angle,
 )
-from dehyst.sim.recordings.proposals import (
-    Candidate,
-    exchanged,
-    in_another_file,
-    likely,
-    likely_time,
-    only_signal,
-    other_channel,
-)
+from dehyst.sim.recordings.proposals import Candidate, likely, likely_time
 from dehyst.sim.recordings.recording import Recording
 from dehyst.sim.recordings.table import MAX_BYTES, Table
 from dehyst.sim.recordings.text_cells import is_packed, opened_bytes
@@ -50,9 +40,8 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     """Read a file, or a folder of Parquet segments in the order of their names.
 
     The ending selects the format: ``.parquet``, ``.mat``, ``.h5``/``.hdf5``, ``.npz``, ``.npy``, ``.tdms``, ``.xlsx``.
-    Other endings: by the first bytes. Any other file is text: a controller's array file or a LabVIEW measurement file
-    where it begins as one, otherwise delimited text. ``mapping.files`` names further files for single quantities;
-    ``sha256`` then covers all of them.
+    Other endings: by the first bytes. Any other file is delimited text. ``mapping.files`` names further files for
+    single quantities; ``sha256`` then covers all of them.
 
     Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
@@ -196,10 +185,6 @@ def _read_as(path: Path, ending: str, head: bytes, mapping: ColumnMap) -> Table:
     for first, what in _REFUSED_BY_FIRST_BYTES.items():
         if head.lstrip().startswith(first):
             raise InputError(f"{path}: is {what}")
-    if text.is_gcs(head):
-        return text.read_gcs(path, _content(path), mapping)
-    if text.is_lvm(head):
-        return text.read_lvm(path, _content(path), mapping)
     return delimited_text.read_delimited(path, head, mapping)
 
 
@@ -311,7 +296,7 @@ class _Reading:
         else:
             one = likely(quantity, table, taken, self._drive(table) if quantity == "y" else None)
         if one is None:
-            return ("--rate HZ",) if quantity == "t" else self._elsewhere(quantity, table)
+            return ("--rate HZ",) if quantity == "t" else (f"--file {quantity}=FILE",)
         self._proposals[quantity] = one
         return self._with_unit(quantity, one, table)
 
@@ -322,18 +307,6 @@ class _Reading:
         if "u" not in self.names or self.by_quantity.get("u", self.main) is not table:
             return None
         return table.column("u", self.names["u"], self.mapping.index.get("u"))[0]
-
-    def _elsewhere(self, quantity: str, table: Table) -> tuple[str, ...]:
-        """The options for a quantity in another file: that of the other channel, where there is one."""
-        path = Path(table.source)
-        other, mine = other_channel(path) if path.is_file() else None, only_signal(table)
-        theirs = None
-        if quantity == "y" and other is not None and mine is not None:
-            with contextlib.suppress(InputError):
-                theirs = only_signal(_table(other, hashlib.sha256(), self.mapping))
-        if theirs is None or mine is None:
-            return in_another_file(quantity, table, None, False)
-        return in_another_file(quantity, table, other, exchanged(mine.values, theirs.values))
 
     def _with_unit(self, quantity: str, one: Candidate, table: Table) -> tuple[str, ...]:
         """The options that make an array a quantity."""

@@ -91,14 +91,6 @@ def encoding_of(path: Path, head: bytes) -> str:
     return "utf-8"
 
 
-def decode(path: Path, content: bytes) -> str:
-    """A whole file of text; see `encoding_of`."""
-    try:
-        return content.decode(encoding_of(path, content))
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
 #: The exponent of Fortran's double precision, and the minus sign that spreadsheets of some countries write.
 _EXPONENT_D = re.compile(r"(?<=[\d.])[dD](?=[+-]\d+$)")
 _MINUS = str.maketrans("\N{MINUS SIGN}", "-")

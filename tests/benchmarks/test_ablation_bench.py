@@ -25,11 +25,9 @@ from benchmarks.ablation import (
     field_variants,
     readers_of,
     rule_variants,
-    scaled,
     shift,
     table,
     variants_of,
-    worse_cases,
     worse_rows,
 )
 from dehyst.adaptive.online.glitch_or_jump import level_of
@@ -57,11 +55,6 @@ def test_the_constants_of_a_module_are_its_numbers_and_tuples_of_numbers() -> No
     assert found["m.SHARE[1]"].shifted(2.0) == (0.6, 3.4)
     assert found["m.TURNS"].shifted(2.0) == (0.0, 0.2, 0.8)
     assert (found["m.COUNT"].shifted(0.5), found["m.BELOW"].shifted(2.0)) == (2, -5.0)
-
-
-def test_an_integer_moves_by_one_at_least() -> None:
-    assert [scaled(value, 0.5) for value in (1, 2, 3, 7)] == [0, 1, 2, 4]
-    assert [type(scaled(value, 2.0)) for value in (1, 1.0)] == [int, float]
 
 
 def test_every_module_of_the_learner_is_looked_through_and_every_rule_replaces_what_is_there() -> None:
@@ -125,11 +118,6 @@ def test_a_shift_reaches_importers() -> None:
     assert in_a_process(shifted) == (40, 40)
 
 
-def test_what_is_read_at_import_is_not_shifted() -> None:
-    half, twice = variants_of(constant("gates.ABSURD"))
-    assert half.impossible == twice.impossible == "read while dehyst.adaptive.online.gates is imported"
-
-
 # ---- comparison
 
 
@@ -155,28 +143,6 @@ def test_a_row_is_worse_where_its_cases_grow_by_more_than_other_noise_does() -> 
     assert rows(BASE | {"c0": case(1.0, worst=100.0)}) == []
     assert rows(REPEATED[0]) == []
     assert rows(BASE) == []
-
-
-def test_a_single_case_that_gets_much_worse_is_told_but_makes_no_row() -> None:
-    groups = {"sensor": NAMES}
-    one = BASE | {"c0": case(1.0, worst=100.0), "c1": case(1.2, unnamed=True)}
-    assert worse_cases(one, BASE, REPEATED, groups) == ["c0: worst × 95.29", "c1: unnamed"]
-    assert worse_cases(REPEATED[0], BASE, REPEATED, groups) == []
-
-
-def test_more_comparisons_ask_for_more() -> None:
-    grown = {name: case(1.0, worst=1.14) for name in NAMES}
-    assert rows(grown, comparisons=10) == ["sensor worst × 1.13"]
-    assert rows(grown, comparisons=10_000) == []
-
-
-def test_verdicts_must_flip_in_two_cases_more_than_by_chance() -> None:
-    assert rows(BASE | {"c0": case(1.0, unnamed=True)}) == []
-    two = BASE | {name: case(1.0, unnamed=True) for name in ("c0", "c1")}
-    assert rows(two) == ["sensor unnamed +2"]
-    assert rows(BASE | {name: {"failed": "ValueError"} for name in ("c0", "c1")}) == ["sensor failed +2"]
-    repeated = [REPEATED[0], two]
-    assert worse_rows(two, BASE, repeated, {"sensor": NAMES}, 10) == []
 
 
 # ---- the whole way, over made-up cases
@@ -233,19 +199,3 @@ def test_a_constant_that_matters_is_told_from_one_that_does_not(
     assert "learner.SHORT_S twice (8 cases run)" in said
     assert again.untested == results.untested
     assert again.worse("learner.FALLBACK_RATIO twice") == results.worse("learner.FALLBACK_RATIO twice")
-
-
-def test_what_raises_has_failed(cases: list[ablation.Case]) -> None:
-    def fail() -> None:
-        raise ValueError("no")
-
-    made = rule_variants()[0]
-    bad = ablation.replace(made, name="bad", begin=fail, places=frozenset())
-    results = ablate(cases, [bad])
-    assert results.variants["bad"]["stage 0"] == {"failed": "ValueError: no"}
-    assert [str(row) for row in results.worse("bad")] == ["intact failed +8"]
-
-
-def test_lines_are_found_by_what_they_read() -> None:
-    lines = text_of(readers_of("dehyst.adaptive.online.sensor_trust", "STEP_STILL").places)
-    assert lines == {"self.still = self.still + 1 if", "self.driven = FORGET * self.driven +"}

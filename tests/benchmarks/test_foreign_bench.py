@@ -11,17 +11,10 @@ import pytest
 
 from benchmarks import foreign
 from benchmarks.foreign import (
-    HEAD,
     LINE,
-    by_class,
     goals,
-    healthy_table,
-    line,
     main,
     read,
-    run_healthy_hours,
-    table,
-    told,
 )
 from dehyst.lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
 from tests.foreign.plants import random_plant
@@ -79,52 +72,6 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
     assert "median over 6 runs" in told_goals
 
 
-def test_jumps_are_counted_beside_the_wrong_readings_that_they_may_come_of() -> None:
-    records = [
-        run("spikes", jumps=1, event={"size": 0.1, "over_s": 2.0}),
-        run("bursts", jumps=0, event={"size": 0.1, "over_s": 3.0}),
-        run("knock", jumps=7, event={"size": 0.1, "over_s": 3.0}),
-    ]
-    assert "1 in some 29 of 2 runs" in last_cells(goals(records))
-
-
-def test_classes_are_rows_in_their_order_then_the_groups() -> None:
-    records = [run("sign", sensor_excess=0.5, named_s=0.4), run("none", troubles=[{"name": "rail"}]), FAILED]
-    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in by_class(records).splitlines()]
-    assert all(len(row) == len(HEAD) for row in rows)
-    assert [row[0] for row in rows[2:]] == [
-        "none", "spikes", "sign", "**stage intact**", "**sensor faults**", "**all**"
-    ]  # fmt: skip
-    none, spikes, sign = rows[2:5]
-    assert none == [
-        "none", "1", "0", "0", "0", "0.100 / 0.100", "0.020 / 0.020", "0.500", "0.50 / 0.50", "-", "-", "1"
-    ]  # fmt: skip
-    assert spikes == ["spikes", "1", "1", *["-"] * 9]
-    assert sign[-3:] == ["1 of 1", "1 of 1", "-"]
-    assert rows[-1][1:3] == ["3", "1"]
-    assert table(records).endswith("runs: 3, of which 1 failed")
-
-
-def test_tables_of_nothing_or_of_what_has_no_number_are_still_tables() -> None:
-    assert last_cells(goals([]))[:2] == ["-", "-; -; -"]
-    nothing = run("knock", worst_ratio=None, settled_pct=None, first_second_pct=None)
-    assert last_cells(goals([nothing]))[2] == "-"
-    assert by_class([nothing]).splitlines()[2].count(" - ") == 5
-
-
-def test_the_line_says_all_in_plain_words() -> None:
-    records = [
-        run("none", settled_pct=0.03), run("knock", settled_pct=0.05), run("gap", settled_pct=0.07, large_s=0.11),
-        run("sign", sensor_excess=0.5, named_s=0.4, settled_pct=3.0, large_s=0.3),
-        run("sensor_gain", sensor_excess=0.5),
-    ]  # fmt: skip
-    assert line(records) == (
-        "foreign stages: 5 runs, 0 at a rail, 1 of 3 with an intact stage above 5 % of range for longer than 0.1 s, "
-        "1 of 2 sensor faults named, 2 of 2 within the error allowed, settled 0.050 % (median)"
-    )
-    assert ", 1 FAILED, 0 at a rail" in line([*records, FAILED])
-
-
 def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
     events = [draw(name, seed, 4.0) for name, seed in LINE]
     assert all(random_plant(seed).traits.dt_s >= 1e-3 for _, seed in LINE)
@@ -133,19 +80,6 @@ def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
     assert random_plant(dict(LINE)["knock"]).traits.modes
     assert sum(event.category == SENSOR for event in events) == 3
     assert len({seed for _, seed in LINE}) == len(LINE) == 12
-
-
-def test_a_file_is_read_again_and_what_failed_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "runs.jsonl"
-    file.write_text(json.dumps(run("none")) + "\n" + json.dumps(FAILED) + '\n{"seed": 3')
-    assert len(read([file])) == 2
-    assert main(["--table", str(file)]) == 1
-    said = capsys.readouterr()
-    assert "**stage intact**" in said.out
-    assert "cut off" in said.err
-    assert told(FAILED) == "seed 7 spikes: FAILED: ValueError: no"
-    assert "plays 1000 Hz" in told(run("sign"))
-    assert "NOT NAMED" in told(run("sign"))
 
 
 @pytest.mark.parametrize(
@@ -174,27 +108,6 @@ def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
     return record | given
 
 
-def test_healthy_runs_are_counted_by_rate_and_the_notable_ones_are_named() -> None:
-    records = [
-        healthy_run(3),
-        healthy_run(4, troubles=[{"name": "sensor_gain", "named_s": 7.0}]),
-        healthy_run(5, stage={"hysteresis": "duhem", "dt_s": 2e-3}, figures={"large_s": 0.3}),
-        {"seed": 6, "class": "healthy", "block": 5, "failed": "Traceback\nValueError: no"},
-    ]
-    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in healthy_table(records).splitlines()[2:5]]
-    assert rows == [
-        ["500", "1", "0", "0.50", "0", "0.00", "1", "0.050 / 0.050"],
-        ["1000", "2", "0", "1.00", "1", "1.00", "0", "0.050 / 0.050"],
-        ["**all**", "4", "1", "1.50", "1", "0.67", "1", "0.050 / 0.050"],
-    ]
-    told_runs = healthy_table(records).splitlines()[6:]
-    assert told_runs[0].startswith("false troubles by name: sensor_gain 1;")
-    assert "seed 4 " in told_runs[1]
-    assert "TROUBLE sensor_gain at 7.00 s" in told_runs[1]
-    assert "LARGE for 0.30 s" in told_runs[2]
-    assert told_runs[3] == "seed 6: FAILED: ValueError: no"
-
-
 def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foreign, "HEALTHY_S", (6.0, 6.0))
     monkeypatch.setattr(foreign, "_pool", ThreadPoolExecutor)
@@ -213,11 +126,3 @@ def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pyt
     # The hours are reached: nothing is run.
     assert main(["--healthy", f"{hours}", "--first-seed", "900001", "--json", str(file)]) == 0
     assert len(read([file])) == 2
-
-
-def test_healthy_runs_end_when_many_fail(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foreign, "_pool", ThreadPoolExecutor)
-    monkeypatch.setattr(
-        foreign, "run_healthy_stage", lambda seed, block: {"seed": seed, "block": block, "failed": "no"}
-    )
-    assert len(list(run_healthy_hours(1.0, 0, 1, 5))) == foreign.MOST_FAILED

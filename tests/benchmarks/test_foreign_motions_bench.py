@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks import foreign
-from benchmarks.foreign_motions import HEAD, fits, planned, run_motion, table, told
+from benchmarks.foreign_motions import HEAD, fits, planned, run_motion, table
 from tests.foreign.plants import random_plant, with_traits
 
 
@@ -21,9 +21,6 @@ def run(name: str, seed: int, **given: Any) -> dict[str, Any]:
         "stage": {"hysteresis": "plays", "dt_s": 1e-3}, "cpu_s": 1.0,
     }  # fmt: skip
     return record | given
-
-
-FAILED = {"seed": 9, "recording": "full", "motion": "raster:10", "failed": "Traceback\nValueError: no"}
 
 
 def cells(text: str) -> list[list[str]]:
@@ -48,26 +45,6 @@ def test_each_motion_is_a_row_with_what_its_runs_came_to_beside_its_goal() -> No
     ]  # fmt: skip
     assert rows[1][0] == "tone:100"
     assert rows[1][7:] == ["1, sensor_gain 2", "45 % (90 %)", "50 % / 25 %", "median ≤ 1.5 %, two seconds ≤ 1.1", "no"]
-
-
-@pytest.mark.parametrize(
-    "worse", [{"adaptive_pct": 0.51}, {"frozen_pct": 0.09}, {"two_seconds": 1.11}], ids=["worst", "frozen", "seconds"]
-)
-def test_one_run_beyond_a_limit_misses_the_goal(worse: dict[str, float]) -> None:
-    good = [run("raster:5", seed) for seed in range(4)]
-    assert cells(table(good))[0][-1] == "yes"
-    assert cells(table([*good, run("raster:5", 9, **worse)]))[0][-1] == "no"
-
-
-def test_runs_that_failed_or_with_a_poor_recording_have_rows_of_their_own() -> None:
-    text = table([FAILED, run("night", 1, recording="poor"), run("night", 2)])
-    assert text.index("full recording") < text.index("poor recording")
-    rows = cells(text)
-    assert [row[:3] for row in rows] == [["raster:10", "1", "1"], ["night", "1", "0"], ["night", "1", "0"]]
-    assert all(len(row) == len(HEAD) for row in rows)
-    assert rows[0][-1] == "-"
-    assert told(FAILED) == "seed 9 raster:10: FAILED: ValueError: no"
-    assert "two seconds 0.90" in told(run("night", 2))
 
 
 def test_fast_motions_go_to_stages_that_can_make_them() -> None:

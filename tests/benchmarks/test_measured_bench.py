@@ -19,11 +19,8 @@ from benchmarks.measured import (
     least_squares,
     main,
     plays,
-    ratio,
     recursive,
     replayed,
-    rmse_pct,
-    worst_ratio,
 )
 from dehyst.baselines import fit_linear
 from dehyst.service.config.settings import COMPETE
@@ -45,33 +42,6 @@ def test_the_recursion_is_weighted_least_squares_of_the_samples_before_the_age()
         information = (Z[rows].T * weight) @ Z[rows] + forget**seen * prior
         expected = Z[n + k] @ np.linalg.solve(information, (Z[rows].T * weight) @ u[rows])
         assert got[k] == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-def test_a_recursion_that_winds_up_begins_anew_with_its_covariance() -> None:
-    Z, u = np.zeros((400, 2)), np.zeros(400)
-    Z[-2:], u[-2:] = np.eye(2), 1.0
-    got = recursive(Z, u, np.zeros(2), np.eye(2), 0.9, 1)
-    assert np.all(np.isfinite(got))
-    assert got[-1] == 0.0
-
-
-def test_plays_follow_at_the_distance_of_their_radius() -> None:
-    got = plays(np.array([0.0, 3.0, 1.0, -4.0]), np.array([0.0, 1.0, 10.0]))
-    assert got.tolist() == [[0, 0, 0], [3, 2, 0], [1, 2, 0], [-4, -3, 0]]
-
-
-def test_scores() -> None:
-    assert rmse_pct(np.array([1.0, 2.0]), np.array([4.0, -2.0]), 50.0) == pytest.approx(2.0 * np.sqrt(12.5))
-    scores = {"frozen": 2.0, "linear": 8.0, "mpi": 0.5, "yardstick": 1.0, "learner": 1.5, "least squares": 0.1}
-    assert ratio(scores, "learner") == 3.0
-    assert ratio(scores | {"mpi": 3.0}, "learner") == 1.5
-
-
-def test_the_worst_window_counts_frozen_at_least_as_its_floor() -> None:
-    one, other = np.array([1.0, 1.0, 4.0, 4.0, 0.2, 0.2]), np.array([1.0, 1.0, 8.0, 8.0, 0.01, 0.01])
-    assert worst_ratio(one, other, 2) == pytest.approx(2.0)  # 0.2 % over the floor of 0.1 %
-    assert worst_ratio(one[:4], other[:4], 2) == pytest.approx(1.0)
-    assert worst_ratio(one[:4], other[:4], 99) == pytest.approx(np.sqrt(34.0 / 130.0))
 
 
 def test_late_readings_are_put_beside_their_voltages(tmp_path: Path) -> None:

@@ -213,11 +213,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     made.close()
 
 
-@pytest.mark.parametrize(("fault", "trouble"), [("nan", "samples_poisoned"), ("freeze", "sensor_frozen")])
-def test_samples_that_lie(world: World, fault: str, trouble: str) -> None:
+def test_samples_that_lie(world: World) -> None:
     world.begin()
-    world.hurt(fault)
-    world.falls_back(lambda s: s["trouble"] == trouble)
+    world.hurt("nan")
+    world.falls_back(lambda s: s["trouble"] == "samples_poisoned")
     world.comes_back()
     assert world.of_trouble() == ["trouble", "learner_went_back", "recovered"]
 

@@ -51,7 +51,7 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             sender = threading.Thread(target=send, args=(other,))
             sender.start()
             try:
-                children.append(started("dehyst.lab.soak.disturbers", "slow", endpoint, Keys(STAGE, AXIS).base))
+                children.append(started("dehyst.lab.soak.disturbers", "slow", endpoint))
                 time.sleep(6.0)
                 # Others come and go meanwhile, which is when everybody would have to wait.
                 for _ in range(4):

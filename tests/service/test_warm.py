@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from importlib.util import cache_from_source
 from pathlib import Path
@@ -52,19 +51,6 @@ def test_the_first_command_of_an_installation_compiles_and_says_so(
     (root / "sim" / "new.py").write_text("VALUE = 2\n")  # another version
     at_first_use(root)
     assert "compiled in" in capsys.readouterr().err
-
-
-def test_a_log_shows_how_far_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = installation(tmp_path / "site-packages")
-    warm = root.parent.joinpath(*GROUPS[0][0].split(".")).with_suffix(".py")
-    warm.write_text("import time\ndef warm():\n    open('dehyst/sim/loop.nbi', 'w').close()\n    time.sleep(2.0)\n")
-    monkeypatch.setattr("dehyst.service.warm._SAID_EVERY_S", 0.5)
-    at_first_use(root)
-    first, *lines = capsys.readouterr().err.splitlines()
-    assert first.startswith("compiling the loops, once: 2 minutes on two idle cores")
-    assert any(re.fullmatch(r"  1 of some \d+ loops, \d+ s", line) for line in lines)
 
 
 def test_a_checkout_is_compiled_at_set_up_and_not_by_commands(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, glitch_burst, scenario
-from dehyst.sim.signals.references import Sequenced, Tones, in_band, strokes
+from dehyst.sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, scenario
+from dehyst.sim.signals.references import Sequenced, Tones
 from dehyst.sim.stage.stage import Stage
 
 
@@ -56,25 +54,6 @@ def test_the_stage_changes_then_and_not_before(kind: str) -> None:
     assert np.max(difference[begin:]) > 5e-3
 
 
-@pytest.mark.parametrize("kind", ["gain_ramp", "creep"])
-def test_what_grows_does_not_jump(kind: str) -> None:
-    s = scenario(kind, 1)
-    u_V = np.full(round(s.duration_s / s.stage.dt_s), 5.0)
-    u_V[:1000] *= np.linspace(0.0, 1.0, 1000)
-    true_um = []
-    for config in (s.stage, s.changing_stage()):
-        stage = Stage(config)
-        true_um.append(stage.run_traced(stage.initial_state(), u_V).true_um)
-    grown = np.abs(true_um[1] - true_um[0])
-    assert grown[-1] > 0.5
-    assert np.max(np.abs(np.diff(grown))) < 0.05
-
-
-def test_the_gain_ramp_ends_at_the_gain_it_names() -> None:
-    s = scenario("gain_ramp", 1)
-    assert s.changes[1][1]["gain_drift.gain"] == pytest.approx(s.changes[0][1]["gain_drift.ramp_per_min"] * 15.0 / 60.0)
-
-
 def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:
     s = dwell(1, np.random.default_rng(1), 5.0)
     assert s.quiet_s is not None
@@ -89,12 +68,6 @@ def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:
     assert stopped.quiet_s == (25.0, 26.0)
     assert stopped.duration_s == 41.0
     assert np.array_equal(stopped.reference().y_um[:25_000], scenario("dwell", 1).reference().y_um[:25_000])
-
-
-@pytest.mark.parametrize("rest_s", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rest_takes_a_time(rest_s: float) -> None:
-    with pytest.raises(InputError, match="rest_s"):
-        scenario("dwell", 1, rest_s)
 
 
 def test_glitches_spoil_their_samples_only_and_the_same_in_blocks() -> None:
@@ -112,32 +85,6 @@ def test_glitches_spoil_their_samples_only_and_the_same_in_blocks() -> None:
     assert np.array_equal(blocks, whole, equal_nan=True)
 
 
-def test_glitch_burst_keeps_to_its_time_length_and_size() -> None:
-    bad = glitch_burst(100, 3100, 0.02, 5, (0.5, 40.0), np.random.default_rng(3))
-    assert len(bad.runs) > 20
-    ends = [first + count for first, count, _ in bad.runs]
-    starts = [first for first, _, _ in bad.runs]
-    assert starts[0] >= 100
-    assert ends[-1] <= 3100
-    assert all(a <= b for a, b in zip(ends[:-1], starts[1:], strict=True))
-    assert {count for _, count, _ in bad.runs} == {1, 2, 3, 4, 5}
-    sizes = np.array([size for _, _, size in bad.runs])
-    assert 0 < np.isnan(sizes).sum() < len(sizes) / 3
-    finite = np.abs(sizes[np.isfinite(sizes)])
-    assert finite.min() >= 0.5
-    assert finite.max() <= 40.0
-
-
-def test_tones_in_a_band_keep_to_band_range_and_speed() -> None:
-    tones = in_band(4.0, 80.0, (8.0, 40.0), (1, 2), 900.0)
-    assert all(8.0 <= f <= 40.0 for f in tones.frequency_Hz)
-    r = tones.at(np.arange(0.0, 5.0, 1e-4))
-    assert r.y_um.min() >= 4.0
-    assert r.y_um.max() <= 80.0
-    assert np.max(np.abs(r.v_um_per_s)) <= 900.0
-    assert np.max(np.abs(r.v_um_per_s)) > 300.0
-
-
 def test_what_cannot_be_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="kind: got 'earthquake'"):
         scenario("earthquake", 1)
@@ -149,9 +96,3 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         Sequenced(((0.3, Tones(1.0)),))
     with pytest.raises(InputError, match="frequency_Hz"):
         Tones(1.0, (1.0,), (), ())
-
-
-def test_strokes_begin_at_the_lower_end() -> None:
-    r = strokes(4.0, 80.0, 0.7, 2.0).at(np.array([2.0, 2.0 + 0.5 / 0.7]))
-    assert r.y_um == pytest.approx([4.0, 80.0])
-    assert replace(r).v_um_per_s == pytest.approx([0.0, 0.0], abs=1e-9)

@@ -13,8 +13,8 @@ from dehyst.service.identification.recording_options import add_mapping_argument
 from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
-Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), DIR/stage.toml, the extended
-stage that `dehyst stage --file` and `dehyst demo --stage` run, and DIR/diagnosis.rrd for the Rerun viewer.
+Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
+extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
 
   dehyst diagnose recording.parquet --out out/diagnosis
@@ -45,7 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         test={"help": "another recording of the stage, same columns: nothing is fitted, the verdict is its own"},
         seed={"help": "seed of the null distribution (%(default)s)"},
     )
-    parser.add_argument("--no-rrd", action="store_true", help="write no diagnosis.rrd")
+    # It used to leave out a file that is written no more.
+    parser.add_argument("--no-rrd", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument(
         "--schema",
         type=int,
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         test="" if args.test is None else args.test.name,
         nominal=str(args.stage.name) if args.stage is not None else args.nominal,
     )
-    data = write_report(args.out, diagnosis, source, rrd=not args.no_rrd, schema=args.schema)
+    data = write_report(args.out, diagnosis, source, schema=args.schema)
     say(f"[100 %] done in {time.perf_counter() - start:.1f} s")
     print(json.dumps(data) if args.json else summary(data, args.out))
     return 0

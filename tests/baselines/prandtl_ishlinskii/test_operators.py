@@ -25,7 +25,6 @@ from dehyst.baselines.prandtl_ishlinskii.operators import (
     dead_zone,
     dead_zone_sum,
     play_run,
-    play_start,
     ramps,
     slopes_to_weights,
 )
@@ -159,10 +158,6 @@ def test_lag_is_led_by_the_inverse() -> None:
 def test_models_without_an_inverse_are_refused(arguments: dict[str, object], named: str) -> None:
     with pytest.raises(InputError, match=named):
         MpiParameters(**arguments)  # type: ignore[arg-type]
-
-
-def test_play_start_is_the_initial_condition() -> None:
-    np.testing.assert_array_equal(play_start(3.0, np.array([0.0, 1.0, 5.0]), y0_V=1.0), [3.0, 2.0, 1.0])
 
 
 # --- Gain and offset of a frame: the Kalman filter of two random walks, and nothing taken that is not finite.

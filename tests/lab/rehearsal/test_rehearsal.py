@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.rehearsal import CLASSES, EVENT_KINDS, SENSOR, Event, RehearsalConfig, draw, factory_of, rehearse
 from dehyst.lab.rehearsal.disturbance import INTACT, MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
-from dehyst.lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
+from dehyst.lab.rehearsal.outcome import outcome
 from dehyst.lab.rehearsal.plant import FunctionPlant, Plant, run_checked
 from dehyst.lab.rehearsal.reference import Excursion, RandomReference, ReferenceRequest
 from dehyst.lab.rehearsal.rehearsal import remarks, table
@@ -57,17 +56,6 @@ def test_a_plant_a_class_a_function_and_what_makes_one_are_taken() -> None:
     assert (made.dt_s, made.u_min_V, made.u_max_V) == (1e-3, 0.0, 10.0)
 
 
-def test_an_object_begins_anew_for_each_run_and_given_numbers_count() -> None:
-    plant = Line2()
-    plant.last_V = 7.0
-    make = factory_of(plant, dt_s=2e-3)
-    first = make()
-    first.run(np.array([50.0]))
-    assert make().run(np.array([1.0]))[0][0] == 7.0
-    assert first.dt_s == 2e-3
-    assert plant.dt_s == 1e-3
-
-
 @pytest.mark.parametrize(
     ("given", "numbers", "words"),
     [
@@ -97,11 +85,6 @@ def test_what_is_no_plant_is_refused_by_name(given: object, numbers: tuple[float
 def test_what_a_plant_answers_is_looked_at(answer: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         run_checked(FunctionPlant(answer, 1e-3, 0.0, 10.0), np.arange(5.0))
-
-
-def test_a_plant_that_does_not_move_is_told_of() -> None:
-    with pytest.raises(InputError, match="a motion under 0 to 10 V"):
-        rehearse(factory_of(lambda u: (0.0 * u, 0.0 * u), 1e-3, 0.0, 10.0), config=SHORT, events=[])
 
 
 # What is asked.
@@ -212,19 +195,6 @@ def test_a_sensor_is_wrong_while_it_lasts_and_not_longer(kind: str, size: float,
         assert np.abs(read[inside] - expected(y[inside])).max() <= (1.0 if kind == "hum" else 1e-3)
 
 
-def test_glitches_are_few_and_large_and_foreign_readings_are_another_motion() -> None:
-    y = np.full(6000, 50.0)
-    spikes = DisturbedSensor(Event("s", "spikes", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
-    hit = np.flatnonzero(spikes)
-    assert 10 <= hit.size <= 60
-    assert np.abs(spikes[hit]).min() >= 0.2 * 50.0
-    bursts = DisturbedSensor(Event("b", "bursts", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
-    assert 2 <= longest_stretch(bursts != 0.0)[0] <= 16
-    foreign = DisturbedSensor(Event("f", "foreign", 2.0, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y)
-    assert 20.0 < np.ptp(foreign[2000:5000]) < 150.0
-    assert (foreign[5000:] == y[5000:]).all()
-
-
 def carried(kind: str, size: float, over_s: float = 0.0, first: int = 2000) -> Any:
     event = Event(kind, kind, 2.0, size, over_s, seed=2)
     values = np.arange(float(first), first + 5.0)
@@ -327,23 +297,6 @@ def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
     assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["event"]["kind"] == "gain"
 
 
-def test_what_swings_about_its_limit_is_one_stretch() -> None:
-    holds = np.zeros(100, dtype=bool)
-    holds[[10, 13, 17, 40]] = True
-    assert np.flatnonzero(gaps_filled(holds, 3)).tolist() == [*range(10, 18), 40]
-    assert longest_stretch(gaps_filled(holds, 3)) == (8, 10)
-    assert longest_stretch(gaps_filled(holds, 30)) == (31, 10)
-    assert longest_stretch(np.zeros(5, dtype=bool)) == (0, 0)
-    # From limit to limit, 200 times a second, to the end.
-    n, quiet = 9000, np.full(9000, 5.0)
-    swing = np.where(np.arange(n) >= 6000, 40.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(n) * DT_S), 0.0)
-    u_V = np.where(np.arange(n) >= 6000, 5.0 + 5.0 * np.sign(swing), 5.0)
-    event = Event("knock", "knock", 4.0, 0.02)
-    result = outcome(event, course(swing, u_V), course(0.0 * swing, quiet), 100.0, Limits(0.0, 10.0, 1e4), DT_S, "")
-    assert result.adaptive.large_s == pytest.approx(3.0, abs=0.01)
-    assert result.adaptive.ends_at_rail
-
-
 def test_trouble_is_timed_by_motion_and_false_where_nothing_happened() -> None:
     limits, n = Limits(0.0, 10.0, 1e4), 9000
     said = np.zeros(n)
@@ -368,23 +321,6 @@ def test_trouble_is_timed_by_motion_and_false_where_nothing_happened() -> None:
     assert np.isnan(nothing.named_s)
 
 
-def test_a_change_is_believed_with_the_first_sample_that_is_not_held_back() -> None:
-    n = 9000
-    still = course(np.zeros(n), np.full(n, 5.0))
-    event, limits = Event("gain_at_once", "gain", 4.0, 0.06), Limits(0.0, 10.0, 1e4)
-
-    def believed(*held: tuple[int, int]) -> float:
-        verdict = np.zeros(n, dtype=np.int16)
-        for first, end in held:
-            verdict[first:end] = 1
-        record = replace(still, verdict=verdict, verdicts=("learnt", "glitch"))
-        return outcome(event, record, still, 100.0, limits, DT_S, "").believed_samples
-
-    assert believed((4002, 4014), (4100, 4200)) == 14.0
-    assert np.isnan(believed((3000, 3100), (4200, 4300)))
-    assert np.isnan(believed((4002, n)))
-
-
 def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() -> None:
     events = [Event("none", "none", 3.0), Event("gain_fast", "gain", 3.0, 0.06, over_s=0.2)]
     factory = random_plant(3)
@@ -405,14 +341,3 @@ def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() ->
     assert json.dumps(done.as_dict(), allow_nan=False)
     assert "the stage's gain changes by +6 %" in table(done)
     assert table(done, markdown=True).count("\n") == 3
-
-
-def test_a_stage_of_200_hz_can_be_disturbed() -> None:
-    """A knock rings slower than its samples can show; of 250 Hz and less the range of such rings was empty."""
-    plant = DisturbedPlant(
-        FunctionPlant(lambda u_V: (u_V, u_V), 5e-3, 0.0, 10.0),
-        Event("knock", "knock", 2.0, 0.05),
-        EventScale(10.0, 5.0, 0.0),
-    )
-    true_um, _ = plant.run(400, np.zeros(100))
-    assert 0.1 < np.abs(true_um).max() <= 0.5

@@ -77,13 +77,6 @@ def test_table_json_and_picture_of_a_plant(plant: Path, tmp_path: Path, capsys: 
     assert "the stage's gain changes" in table
 
 
-def test_the_classes_of_events_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["rehearse", "--plant", "-", "--events", "list"]) == 0
-    told = capsys.readouterr().out
-    assert "knock" in told
-    assert "sensor" in told
-
-
 @pytest.mark.parametrize(
     ("name", "more", "words"),
     [
@@ -125,6 +118,31 @@ def test_readings_of_another_stage_steer_the_example_nowhere() -> None:
     done = rehearse(made, events=[event])
     assert not failed(remarks(done.runs[0].outcome))
     assert done.runs[0].outcome.named_s < 0.5
+
+
+def test_faults_make_nothing_compile_that_an_installation_has_not(plant: Path, tmp_path: Path) -> None:
+    """Ten seconds of compiling in the thread that learns are what the first jump of a new installation led to."""
+    watched = """
+import sys
+from numba.core import event
+from dehyst.lab.cli import main
+
+class Compiled(event.Listener):
+    def on_start(self, event):
+        print("compiled:", event.data["dispatcher"].py_func.__qualname__, file=sys.stderr)
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Compiled())
+sys.exit(main(sys.argv[1:]))
+"""
+    arguments = ["rehearse", "--plant", f"{plant}:Stage", "--out", str(tmp_path), "--settle", "2", "--after", "4"]
+    done = subprocess.run(
+        [sys.executable, "-c", watched, *arguments, "--events", "stuck,sign,zero_at_once,gap,knock"],
+        capture_output=True, text=True, timeout=170, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [line for line in done.stderr.splitlines() if line.startswith("compiled:")] == []
 
 
 def test_ctrl_c_ends_it_at_once_and_without_a_traceback(plant: Path, tmp_path: Path) -> None:

@@ -6,45 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from dehyst.lab.soak.controller import ControlTask
 from dehyst.lab.soak.fault_plan import FAULT_KINDS, make_plan
-from dehyst.lab.soak.judge import MEMORY_MB, TRACKING_PCT, assess, recorded, unrecordable
-from dehyst.lab.soak.observed import FaultRecord, Observations, SampleTracker
+from dehyst.lab.soak.judge import MEMORY_MB, TRACKING_PCT
+from dehyst.lab.soak.observed import FaultRecord, Observations
 from dehyst.lab.soak.report import draw, report, verdict_line
-from dehyst.service.protocol.samples import SampleBatch
-from dehyst.service.storage.recorder import Recorder, RecorderConfig
 from tests.lab.soak.soaked import broken, healthy, verdict
-
-CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
-
-
-def test_the_track_counts_errors_steps_and_held_voltages() -> None:
-    now = 0.0
-    track = SampleTracker(CONTROL, lambda: now)
-    track.want(0, np.array([1.0, 2.0, 3.0, 4.0]))
-    track.command(0, np.array([0.0, 1.0, 1.5]))
-
-    def take(first: int, u_V: list[float], y_um: list[float]) -> None:
-        seq = np.arange(first, first + len(u_V), dtype=np.int64)
-        samples = SampleBatch(seq, seq * 1e-3, np.array(u_V), np.array(y_um))
-        track.take(samples)
-        track.take_sound(samples)
-
-    take(0, [0.0, 1.0], [1.5, 2.0])
-    take(2, [1.5, 1.5], [np.nan, 3.0])
-    track.take(SampleBatch(np.array([2]), np.array([2e-3]), np.array([9.0]), np.array([3.0])))
-    now = 1.5
-    take(6, [11.0, np.nan], [0.0, 0.0])
-    first, second = track.seconds
-    assert (first.samples, first.judged, first.held) == (5, 3, 2)
-    assert first.error_sum_um == pytest.approx(0.5 + 0.0 + 1.0)
-    assert first.step_V == pytest.approx(1.0), "neither the repeated sample nor the gap makes a step"
-    assert second.beyond_V == pytest.approx(1.0)
-    assert second.not_finite == 1
-    assert track.seen.spans == [(0, 4), (6, 8)]
 
 
 def test_a_healthy_run_holds_and_has_the_promised_form() -> None:
@@ -105,10 +73,6 @@ def test_every_invariant_is_broken_by_what_it_is_there_for(what: str) -> None:
     assert found["verdict"] == "broken"
 
 
-def test_a_lost_record_breaks_the_run() -> None:
-    assert broken(verdict(healthy(), missing=1)) == {"no_record_lost"}
-
-
 def test_samples_are_accounted_for() -> None:
     def thinned(k: int, status: dict[str, Any]) -> None:
         samples = status["samples"]
@@ -140,20 +104,6 @@ def test_memory_in_use_is_compared_with_that_after_the_warm_up(grows_mb: float, 
     assert verdict(healthy(700, grows))["not_judged"] == ["memory"], "less than ten minutes after the warm-up"
 
 
-def test_bad_messages_are_told_where_queries_and_samples_are_counted() -> None:
-    """Of both: a service that counts the queries alone has not told of the samples."""
-    for both in (True, False):
-
-        def count(k: int, status: dict[str, Any], both: bool = both) -> None:
-            status["queries"] = {"errors": 5 * (k > 10)}
-            status["samples"]["malformed"] = 5 * (k > 10 and both)
-
-        observed = healthy(change=count)
-        observed.faults[0].kind = "bad_queries"
-        assess(observed)
-        assert bool(observed.faults[0].told) is both
-
-
 def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
     observed = healthy()
     for second in observed.seconds[36:]:
@@ -164,35 +114,6 @@ def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
         second.error_sum_um = 1000.0
     observed.faults[-1] = FaultRecord("gap", 31.0, 32.0)
     assert broken(verdict(observed)) == {"recovers_by_itself", "faults_told", "tracking"}
-
-
-def test_what_a_run_does_not_tell_is_named_with_the_reason() -> None:
-    observed = healthy()
-    for second in observed.seconds:
-        second.held = 1
-    assert verdict_line(verdict(observed)).startswith("held; not judged: tracking (no such second), memory")
-    # Where every second is one of a fault nobody can say how soon queries are answered without one.
-    observed.faults = [FaultRecord("gain", 0.0, 30.0)]
-    assert {"queries_answered", "follower_age"} <= set(verdict(observed)["not_judged"])
-
-
-def test_samples_that_were_recorded_aside_are_in_a_recording(tmp_path: Path) -> None:
-    k = np.arange(1000)
-    with Recorder(RecorderConfig(tmp_path)) as recorder:
-        recorder.put(k[:400], k[:400] * 1e-3, k[:400] * 0.1, k[:400] * 0.1, "learnt")
-        recorder.put_aside(k[400:], k[400:] * 1e-3, k[400:] * 0.1, k[400:] * 0.1, "thinned")
-    found, rows = recorded([tmp_path])
-    assert (len(found), rows) == (1000, 1000)
-
-
-def test_what_was_seen_just_before_the_router_went_proves_nothing() -> None:
-    observed = healthy()
-    observed.faults = [FaultRecord("restart_router", 10.4, 10.5)]
-    ((start, stop),) = unrecordable(observed).spans
-    assert start == 8_001
-    assert stop == 23_001, "in time to recover"
-    observed.faults = [FaultRecord("gap", 10.4, 10.5)]
-    assert len(unrecordable(observed)) == 0
 
 
 def test_the_files_of_a_run_say_what_was_found(tmp_path: Path) -> None:

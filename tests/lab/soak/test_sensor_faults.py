@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from dehyst.lab.soak.actions import FaultActions
 from dehyst.lab.soak.controller import STRAY, ControlTask, SoakReference
-from dehyst.lab.soak.fault_plan import PlannedFault, make_plan
 from dehyst.lab.soak.judge import judge_sensor_fault, stage_gain
-from dehyst.lab.soak.observed import FaultRecord, SampleTracker, troubles_since
+from dehyst.lab.soak.observed import FaultRecord, SampleTracker
 from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
 from dehyst.service.stage_node.faults import Fault, Injector
 from tests.lab.soak.soaked import broken, healthy, verdict
@@ -67,15 +63,6 @@ def delivered(kind: str, value: float) -> tuple[list[int], Injector]:
     return sent, injector
 
 
-def test_losses_take_their_share_and_are_counted() -> None:
-    sent, injector = delivered("losses", 0.9)
-    assert [k for k in sent if k < 500] == list(range(450, 500))
-    assert [k for k in sent if k >= 900] == list(range(900, 1000))
-    inside = [k for k in sent if 500 <= k < 900]
-    assert 15 <= len(inside) <= 75
-    assert injector.counts["losses"] == 400 - len(inside)
-
-
 @pytest.mark.parametrize("value", [1e5, float(2**62)])
 def test_one_sample_has_a_number_far_ahead(value: float) -> None:
     sent, injector = delivered("seq_jump", value)
@@ -121,13 +108,6 @@ def test_a_stage_that_has_changed_may_be_off_as_the_frozen_model_is() -> None:
     assert [stage_gain(faults, at_s) for at_s in (2.0, 4.0, 10.0)] == [1.0, 0.95, 1.0]
 
 
-def test_a_fault_that_is_named_in_time_and_costs_little_breaks_nothing() -> None:
-    fault = Run(0.5).judged((2200, "sensor_sign"))
-    assert (fault.breaches, fault.unjudged) == ([], [])
-    assert fault.error_pct == pytest.approx(100.0 * 0.5 / 76.0)
-    assert 0.1 < fault.named_s <= 0.2
-
-
 @pytest.mark.parametrize(
     ("off_um", "troubles", "words"),
     [
@@ -157,16 +137,6 @@ def test_a_stage_at_rest_names_nothing_and_held_voltages_say_nothing_of_the_mode
     assert math.isnan(fault.error_pct)
 
 
-def test_troubles_are_those_since_a_sample() -> None:
-    events = [
-        {"event": "trouble", "seq": 5, "detail": "sensor_gain (old): x"},
-        {"event": "recovered", "seq": 6, "detail": "sensor_gain"},
-        {"event": "trouble", "seq": 9, "detail": "sensor_stuck (why): the last good model"},
-        {"event": "trouble", "seq": 12, "detail": "rail: the identified model"},
-    ]
-    assert troubles_since(events, 6) == [(9, "sensor_stuck"), (12, "rail")]
-
-
 def test_a_wrong_number_does_not_blind_the_soak_itself() -> None:
     track = SampleTracker(CONTROL, lambda: 1.0)
 
@@ -184,93 +154,4 @@ def test_a_wrong_number_does_not_blind_the_soak_itself() -> None:
     assert track.newest == 4 + STRAY
 
 
-def test_a_fault_of_many_values_has_another_one_every_round() -> None:
-    plan = make_plan(400.0, 1, ("sensor_gain", "seq_jump"))
-    for kind, least in (("sensor_gain", 3), ("seq_jump", 2)):
-        values = [fault.value for fault in plan.faults if fault.kind == kind]
-        assert len(set(values)) >= least
-
-
 # ---- strangers and folders
-
-
-class Stepping:
-    def __init__(self, told: dict[str, int]) -> None:
-        self.told = told
-
-    def send(self, _: int) -> None: ...
-
-    def wait(self, _: float) -> None: ...
-
-    def last_json(self) -> dict[str, int]:
-        return self.told
-
-
-class Watched:
-    """A monitor and a rig with one service, whose role, events and folders a test changes."""
-
-    def __init__(self, folder: Path, told: dict[str, int]) -> None:
-        self.events: list[dict[str, Any]] = []
-        self.status: dict[str, Any] = {
-            "instance": "i7-a", "role": "primary", "epoch": 3, "frozen": True, "recorder": {"degraded": True}
-        }  # fmt: skip
-        self.model = folder / "model.npz"
-        self._told, self._folder = told, folder
-
-    def recent(self, _: float) -> list[dict[str, Any]]:
-        return [self.status]
-
-    def now(self) -> float:
-        return 1.0
-
-    def start_helper(self, *_: object) -> Stepping:
-        return Stepping(self._told)
-
-    def service_of(self, _: str) -> str:
-        return "a"
-
-    def take_folders_away(self, *_: object) -> list[Path]:
-        return [self._folder / "recording"]
-
-
-@pytest.mark.parametrize(
-    ("told", "change", "words"),
-    [
-        ({"tried": 3, "states": 0}, {}, ""),
-        ({"tried": 3, "states": 1}, {}, "given the state 1 times"),
-        ({"tried": 3, "states": 0}, {"epoch": 4}, "serves as number 4"),
-        ({"tried": 3, "states": 0}, {"instance": "i9-rogue"}, "i9-rogue serves"),
-        ({"tried": 3, "states": 0}, {"event": "stood_down"}, "moved a service: stood_down"),
-    ],
-)
-def test_a_stranger_that_gets_or_moves_anything_breaks_the_fault(
-    told: dict[str, int], change: dict[str, Any], words: str, tmp_path: Path
-) -> None:
-    watched = Watched(tmp_path, told)
-    actions = FaultActions(watched, watched)  # type: ignore[arg-type]
-    actions.begin(PlannedFault("forged_state", 1.0, 3.0))
-    if "event" in change:
-        watched.events.append({"t_s": 0.5, "event": change["event"]})
-    else:
-        watched.status |= change
-    actions.end()
-    assert [breach for breach in actions.breaches if words in breach] == actions.breaches[:1] if words else True
-    assert bool(actions.breaches) is bool(words)
-
-
-@pytest.mark.parametrize(
-    ("degraded", "made", "words"),
-    [(True, True, ""), (False, True, "does not say degraded"), (True, False, "not made anew")],
-)
-def test_a_folder_that_vanishes_must_be_told_and_made_anew(
-    degraded: bool, made: bool, words: str, tmp_path: Path
-) -> None:
-    watched = Watched(tmp_path, {})
-    actions = FaultActions(watched, watched)  # type: ignore[arg-type]
-    actions.begin(PlannedFault("folder_removed", 1.0, 3.0))
-    watched.status["recorder"] = {"degraded": degraded}
-    if made:
-        (tmp_path / "recording").mkdir()
-    actions.end()
-    assert words in "".join(actions.breaches)
-    assert bool(actions.breaches) is bool(words)

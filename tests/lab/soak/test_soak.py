@@ -37,17 +37,6 @@ def test_faults_follow_one_another_with_time_to_recover(seed: int, duration_s: f
     assert set(plan.left_out) | {fault.kind for fault in plan.faults} == set(FAULT_KINDS)
 
 
-def test_what_ends_a_service_comes_early_in_a_long_run() -> None:
-    plan = make_plan(2400.0, 1, tuple(FAULT_KINDS))
-    assert not plan.left_out
-    ends = [fault.at_s for fault in plan.faults if FAULT_KINDS[fault.kind].ends_service]
-    assert len(ends) >= 4
-    assert max(ends) <= 0.4 * 2400.0
-    assert make_plan(2400.0, 2, tuple(FAULT_KINDS)).faults != plan.faults
-    gains = [fault.value for fault in plan.faults if fault.kind == "gain"]
-    assert gains[0] < 0.0 == gains[1], "there and back again"
-
-
 def test_unknown_kinds_and_odd_durations_are_refused() -> None:
     with pytest.raises(InputError, match="--faults: got 'fire', expected none, or some of: kill_primary"):
         select_kinds(["nan", "fire"])
@@ -62,20 +51,15 @@ def test_unknown_kinds_and_odd_durations_are_refused() -> None:
 # ---- the reference
 
 
-@given(first=st.integers(0, 300_000), start=st.integers(1000, 200_000), ticks=st.integers(1500, 6000))
-@settings(max_examples=25, deadline=None)
-def test_reference_repeats_rests_and_its_derivatives_belong_together(first: int, start: int, ticks: int) -> None:
-    reference = SoakReference(1e-3, 4.0, 80.0, 3, [(start, ticks)])
-    for at in (first, start - 200, start + ticks - 500, round(PERIOD_S / 1e-3) - 300):
+def test_reference_repeats_and_its_derivatives_belong_together() -> None:
+    reference = SoakReference(1e-3, 4.0, 80.0, 3)
+    for at in (0, 31_000, round(PERIOD_S / 1e-3) - 300):
         y, v, a = reference.rows(at, 1200)
         assert y.min() >= 4.0 - 1e-9
         assert y.max() <= 80.0 + 1e-9
         np.testing.assert_allclose(np.gradient(y, 1e-3)[1:-1], v[1:-1], atol=0.5)
         np.testing.assert_allclose(np.gradient(v, 1e-3)[1:-1], a[1:-1], atol=60.0)
-    rest = reference.rows(start + 650, ticks - 1300)
-    np.testing.assert_allclose(rest[0], 42.0, atol=1e-9)
-    plain = SoakReference(1e-3, 4.0, 80.0, 3)
-    np.testing.assert_array_equal(plain.rows(5, 100), plain.rows(5 + round(PERIOD_S / 1e-3), 100))
+    np.testing.assert_array_equal(reference.rows(5, 100), reference.rows(5 + round(PERIOD_S / 1e-3), 100))
 
 
 # ---- which numbers were seen
@@ -151,24 +135,6 @@ def test_deliveries_are_withheld_repeated_and_exchanged() -> None:
     seq, t_s, _ = sent("clock", -3600.0)
     assert seq == every
     assert [k for k, t in zip(seq, t_s, strict=True) if t < 0.0] == list(range(4, 16))
-
-
-def test_a_change_is_made_once_and_a_bad_one_is_counted() -> None:
-    changes: list[dict[str, float]] = []
-
-    def apply(values: dict[str, float]) -> None:
-        if "nothing" in values:
-            raise InputError("nothing: unknown")
-        changes.append(values)
-
-    injector = Injector(1e-3, apply)
-    injector.receive(b'{"fault": "change", "values": {"gain_drift.gain": -0.05}}')
-    injector.receive(b'{"fault": "change", "values": {"nothing": 1}}')
-    for k in range(5):
-        injector.reading(k, 0.0)
-    assert changes == [{"gain_drift.gain": -0.05}]
-    assert injector.counts["refused"] == 1
-    assert "unknown" in injector.error
 
 
 @pytest.mark.parametrize(

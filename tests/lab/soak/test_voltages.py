@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import struct
-import time
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
-from dehyst.lab.soak.controller import AXIS, STAGE, ControlTask
-from dehyst.lab.soak.observed import FaultRecord, Monitor, Observations, SampleTracker
+from dehyst.lab.soak.controller import ControlTask
+from dehyst.lab.soak.observed import FaultRecord, SampleTracker
 from dehyst.service.protocol import samples as wire
-from dehyst.service.runtime.session import open_router
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
@@ -66,13 +60,6 @@ def driven() -> Driven:
     return driven
 
 
-def test_what_is_safe_breaks_nothing(driven: Driven) -> None:
-    driven.send(FIRST + 3, 6.0, 10.0, 6.0)
-    driven.run(FIRST + 6)
-    assert driven.broken() == set()
-    assert driven.track.seconds[-1].step_V == pytest.approx(4.0)
-
-
 @pytest.mark.parametrize(
     ("block", "name"),
     [
@@ -91,13 +78,6 @@ def test_what_the_stage_clamps_breaks_the_run_as_it_was_sent(
     assert driven.broken() == {name}
 
 
-def test_a_jump_at_a_take_over_is_one_of_what_was_sent(driven: Driven) -> None:
-    driven.send(FIRST + 3, 8.0)
-    driven.run(FIRST + 4)
-    fault = FaultRecord("kill_primary", 44.5, 44.5)
-    assert driven.broken(fault) == {"voltages_within_slew"}
-
-
 def test_a_block_may_be_sent_anew_from_the_voltage_before_it(driven: Driven) -> None:
     driven.send(FIRST + 3, 6.0, 9.0)
     driven.send(FIRST + 3, -1.0, -2.0)
@@ -105,67 +85,3 @@ def test_a_block_may_be_sent_anew_from_the_voltage_before_it(driven: Driven) -> 
     assert driven.broken() == set()
     driven.send(FIRST + 5, 9.0)
     assert driven.broken() == {"voltages_within_slew"}, "from what replaced the first, not from what it replaced"
-
-
-def test_over_samples_without_a_command_the_stage_holds(driven: Driven) -> None:
-    """A controller that gave a block up begins the next where the last one that it sent has ended."""
-    driven.run(FIRST + 23)
-    driven.send(FIRST + 23, 6.0)
-    driven.run(FIRST + 24)
-    assert driven.broken() == set()
-    driven.run(FIRST + 40)
-    driven.send(FIRST + 40, -1.0)
-    driven.run(FIRST + 41)
-    assert driven.broken() == {"voltages_within_slew"}
-
-
-def test_while_no_router_is_there_what_was_sent_may_have_come_to_nobody(driven: Driven) -> None:
-    driven.send(FIRST + 3, 6.0, 10.0, reaches=False, seen=False)
-    driven.send(FIRST + 5, 9.0)
-    driven.run(FIRST + 6)
-    assert driven.broken(FaultRecord("restart_router", 44.5, 44.6)) == set()
-    assert driven.broken() == {"voltages_within_slew"}
-
-
-def test_the_first_block_of_a_life_follows_nothing(driven: Driven) -> None:
-    driven.send(FIRST + 3, 6.0, 10.0)
-    driven.run(FIRST + 5)
-    driven.rest(7)
-    driven.send(7, -1.0, -1.0)
-    driven.run(9)
-    assert driven.broken() == set()
-    driven.send(9, 8.0)
-    assert driven.broken() == {"voltages_within_slew"}
-
-
-def test_a_command_that_cannot_be_read_is_no_safe_one(free_port: int) -> None:
-    """NaN does not pass the wire's own decoder; that it was sent is what counts."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    with open_router([endpoint]) as server:
-        monitor = Monitor(endpoint, CONTROL, time.monotonic() - 45.0)
-        try:
-            key = f"dehyst/v1/{STAGE}/{AXIS}/command"
-            good = wire.encode_command(FIRST, [0.0, 1.0])
-            poisoned = good[:-8] + struct.pack("<d", float("nan"))
-            _until(lambda: _sent(server, key, good) and bool(monitor.track.seconds))
-            assert sum(s.not_finite for s in monitor.track.seconds) == 0
-            server.put(key, poisoned)
-            _until(lambda: monitor.malformed > 0)
-            assert sum(s.not_finite for s in monitor.track.seconds) == 1
-            observed: Observations = healthy()
-            observed.seconds += monitor.track.seconds
-            assert broken(verdict(observed)) == {"voltages_finite"}
-        finally:
-            monitor.close()
-
-
-def _sent(session: Any, key: str, payload: bytes) -> bool:
-    session.put(key, payload)
-    return True
-
-
-def _until(done: Callable[[], bool], patience_s: float = 10.0) -> None:
-    end = time.monotonic() + patience_s
-    while not done():
-        assert time.monotonic() < end, "nothing came"
-        time.sleep(0.02)

@@ -178,15 +178,6 @@ def test_an_adapter_that_does_not_fit_the_model_is_refused() -> None:
         StageLoop(high, client)  # type: ignore[arg-type]
 
 
-def test_a_run_ends_when_it_is_told_to() -> None:
-    loop, _ = make(PlainStage(200.0))
-    thread = threading.Thread(target=loop.run, args=(lambda *_: 0.0,))
-    thread.start()
-    loop.stop()
-    thread.join(5.0)
-    assert not thread.is_alive()
-
-
 def test_a_recording_is_read_again_as_it_was_taken(tmp_path: Any) -> None:
     stage = PlainStage(500.0, u_max_V=50.0)
     voltage = excitation(5.0, 45.0, 500.0, duration_s=1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import re
-import socket
 import subprocess
 import sys
 import types
@@ -15,7 +14,6 @@ from typing import Any
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.adapters import simulated_pi
 from dehyst.service.adapters.adapter import AdapterError, StageAdapter, Stated
 from dehyst.service.adapters.jena import Nv200Stage
 from dehyst.service.adapters.ni import NiStage
@@ -54,19 +52,6 @@ def pi_port() -> Iterator[int]:
     process.wait(10)
 
 
-def test_the_simulated_pi_controller_says_what_is_wrong_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = str(other.getsockname()[1])
-        for words, message in (
-            (["--port", port], f"port {port} is not free"),
-            (["--gain-drop", "6 %"], "--gain-drop: got '6 %', expected S:SHARE"),
-        ):
-            with pytest.raises(SystemExit) as ended:
-                simulated_pi.main(words)
-            assert ended.value.code == 2
-            assert message in capsys.readouterr().err
-
-
 @needs_pipython
 def test_a_pi_controller_is_read_and_driven_by_gcs(pi_port: int) -> None:
     # Twice: a device that was closed must not stand in the way of the next connection.
@@ -91,12 +76,6 @@ def test_a_refused_voltage_of_a_pi_controller_is_an_error(pi_port: int) -> None:
         with pytest.raises(Exception, match="302"):
             stage.write_V(500.0)
         assert stage.applied_V() == 0.0
-
-
-@needs_pipython
-def test_an_axis_that_a_pi_controller_lacks_is_an_error(pi_port: int) -> None:
-    with pytest.raises(AdapterError, match="axis '7'"):
-        PiStage("127.0.0.1", axis="7", port=pi_port)
 
 
 @needs_pipython

@@ -89,17 +89,6 @@ def points(y: FloatArray, v: float = 0.0) -> tuple[FloatArray, FloatArray, Float
     return y, np.full(y.size, v), np.zeros(y.size)
 
 
-def test_inside_the_domain_the_model_answers_alone() -> None:
-    y = np.linspace(20.0, 30.0, 20)
-    memory = LSSVM.rest_memory(20.0)
-    alone = LSSVM.feedforward(*points(y), memory)
-    got = answer_safely(LSSVM, memory, points(y), math.nan, Rules(LIMITS), LINE)
-    np.testing.assert_array_equal(got.u_V, alone.u_V)
-    np.testing.assert_array_equal(got.std_V, alone.std_V)
-    assert not got.flags.any()
-    assert (got.stand_in, got.fallback) == ("", False)
-
-
 def test_a_model_is_asked_once_and_its_answer_stands_where_nothing_speaks_against_it() -> None:
     y, memory, rules = np.linspace(20.0, 30.0, 5), np.zeros(1), Rules(LIMITS)
 
@@ -152,32 +141,6 @@ def test_outside_it_passes_smoothly_to_the_baseline_and_says_so() -> None:
     assert got.std_V[middle] == pytest.approx(
         math.sqrt(0.5 * model.std_V[middle] ** 2 + 0.5 * line.std_V[middle] ** 2 + 0.25 * gap**2), rel=1e-2
     )
-
-
-def test_who_does_not_blend_answers_as_itself_but_never_what_is_not_finite() -> None:
-    y = np.array([40.0, 41.0, 42.0])
-    outside = Says((4.0, 4.1, 4.2), inside=False)
-    got = answer_safely(outside, np.zeros(1), points(y), math.nan, Rules(LIMITS, trust=0.0), LINE, blends=False)
-    assert got.u_V.tolist() == [4.0, 4.1, 4.2]
-    assert (got.flags == OUTSIDE_DOMAIN).all()
-    broken = Says((4.0, math.nan, math.inf))
-    got = answer_safely(broken, np.zeros(1), points(y), math.nan, Rules(LIMITS), LINE, blends=False)
-    assert got.u_V.tolist() == pytest.approx([4.0, 40.0 / 11.0, 41.0 / 11.0])
-    assert got.flags.tolist() == [0, NOT_FINITE_REPLACED | STAND_IN, NOT_FINITE_REPLACED | STAND_IN]
-    assert got.fallback
-    assert got.stand_in == "linear"
-
-
-def test_a_model_that_raises_is_one_that_says_nothing() -> None:
-    y = np.array([40.0, 41.0])
-    got = answer_safely(Says((), raises=True), np.array([7.0]), points(y), math.nan, Rules(LIMITS), LINE)
-    assert got.u_V.tolist() == pytest.approx([39.0 / 11.0, 40.0 / 11.0])
-    assert got.memory.tolist() == [7.0]
-    assert got.fallback
-    # And with nobody to stand in, what was applied last.
-    got = answer_safely(Says((), raises=True), np.array([7.0]), points(y), 3.0, Rules(LIMITS), None)
-    assert got.u_V.tolist() == [3.0, 3.0]
-    assert (got.flags & NOT_FINITE_REPLACED).all()
 
 
 def test_less_trust_is_more_of_the_baseline_everywhere() -> None:
@@ -322,14 +285,6 @@ def test_the_points_of_a_trajectory_are_limited_as_each_point_is_alone(u: np.nda
         assert (before, alone) == (got_V, bits)
 
 
-def test_each_flag_says_what_was_done() -> None:
-    u = np.array([12.0, 8.9, 8.8, math.nan, 4.0])
-    inside = np.array([True, False, True, True, True])
-    safe, flags = guard(u, inside, GUARD_DT_S, GUARD_LIMITS)
-    assert flags.tolist() == [LIMITED_VOLTAGE, OUTSIDE_DOMAIN, 0, NOT_FINITE_REPLACED, LIMITED_SLEW]
-    np.testing.assert_allclose(safe, [9.0, 8.9, 8.8, 8.8, 8.8 - GUARD_STEP_V])
-
-
 def test_a_desired_point_beyond_the_stage_is_refused_by_its_index() -> None:
     check_domain(np.array([0.0, 90.0]), GUARD_LIMITS)
     with pytest.raises(InputError, match=r"y_um\[2\]: got 90.5 µm, expected 0 to 90 µm"):
@@ -348,9 +303,27 @@ def test_limits_that_limit_nothing_are_refused(values: tuple[float, ...], field:
         Limits(*values)
 
 
-def test_limits_travel_as_json() -> None:
-    open_ended = Limits(0.0, 1.0, math.inf)
-    assert Limits.from_json(open_ended.to_json()) == open_ended
-    assert Limits.from_json(GUARD_LIMITS.to_json()) == GUARD_LIMITS
-    with pytest.raises(InputError, match="limits"):
-        Limits.from_json({"u_min_V": 0.0})
+def test_who_does_not_blend_answers_as_itself_but_never_what_is_not_finite() -> None:
+    y = np.array([40.0, 41.0, 42.0])
+    outside = Says((4.0, 4.1, 4.2), inside=False)
+    got = answer_safely(outside, np.zeros(1), points(y), math.nan, Rules(LIMITS, trust=0.0), LINE, blends=False)
+    assert got.u_V.tolist() == [4.0, 4.1, 4.2]
+    assert (got.flags == OUTSIDE_DOMAIN).all()
+    broken = Says((4.0, math.nan, math.inf))
+    got = answer_safely(broken, np.zeros(1), points(y), math.nan, Rules(LIMITS), LINE, blends=False)
+    assert got.u_V.tolist() == pytest.approx([4.0, 40.0 / 11.0, 41.0 / 11.0])
+    assert got.flags.tolist() == [0, NOT_FINITE_REPLACED | STAND_IN, NOT_FINITE_REPLACED | STAND_IN]
+    assert got.fallback
+    assert got.stand_in == "linear"
+
+
+def test_a_model_that_raises_is_one_that_says_nothing() -> None:
+    y = np.array([40.0, 41.0])
+    got = answer_safely(Says((), raises=True), np.array([7.0]), points(y), math.nan, Rules(LIMITS), LINE)
+    assert got.u_V.tolist() == pytest.approx([39.0 / 11.0, 40.0 / 11.0])
+    assert got.memory.tolist() == [7.0]
+    assert got.fallback
+    # And with nobody to stand in, what was applied last.
+    got = answer_safely(Says((), raises=True), np.array([7.0]), points(y), 3.0, Rules(LIMITS), None)
+    assert got.u_V.tolist() == [3.0, 3.0]
+    assert (got.flags & NOT_FINITE_REPLACED).all()

@@ -13,7 +13,6 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.sensor_trust import SENSOR_FAULTS
 from dehyst.adaptive.state import restore, save
 from dehyst.adaptive.types import InverseModel
-from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.service.answers.guard import Limits
 from dehyst.service.answers.which_model import (
     MODELS,
@@ -23,14 +22,11 @@ from dehyst.service.answers.which_model import (
     ModelChoice,
     Seen,
     answering,
-    is_identified,
     page,
     rule_of,
-    seen_in,
 )
 from dehyst.service.client.follower import Follower
 from dehyst.service.protocol.model import Safety, StandIn, encode_model
-from dehyst.service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
 from tests.service.conftest import DT_S, make_models
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -61,30 +57,6 @@ def test_the_page_is_up_to_date() -> None:
 def test_the_first_row_that_holds_says_which_model_answers() -> None:
     assert set(SITUATIONS) == set(Answering) == set(MODELS) == {row.answers for row in ROWS}
     assert {answers: answering(seen) for answers, seen in SITUATIONS.items()} == {one: one for one in Answering}
-
-
-@pytest.mark.parametrize(
-    ("seen", "answers"),
-    [
-        (Seen(learns=False), Answering.IDENTIFIED),
-        (Seen(weight=0.999), Answering.BLENDED),
-        (Seen("nothing_learnt"), Answering.LEARNT),
-        (Seen("samples_lost"), Answering.LEARNT),
-    ],
-)
-def test_the_rest_of_the_rows(seen: Seen, answers: Answering) -> None:
-    assert answering(seen) is answers
-
-
-def test_flags_of_a_point_and_who_gave_it_say_the_same() -> None:
-    line = make_models()["linear"]
-    first, second = (ChampionInverse(("learner", "line"), (line, line), champion) for champion in (0, 1))
-    assert answering(seen_in(0, first)) is Answering.LEARNT
-    assert answering(seen_in(STALE, first, "sensor_sign")) is Answering.LAST_GOOD
-    assert answering(seen_in(0, second)) is Answering.RIVAL
-    assert answering(seen_in(BLENDED, second)) is Answering.BLENDED
-    assert answering(seen_in(STAND_IN | NOT_FINITE_REPLACED, None)) is Answering.STAND_IN
-    assert answering(seen_in(NOT_FINITE_REPLACED, None)) is Answering.HELD
 
 
 @pytest.mark.parametrize(
@@ -180,14 +152,6 @@ def test_a_trouble_that_lasts_takes_the_trust_and_its_end_gives_it_back(trouble:
     assert life.choice.trust == 1.0
 
 
-def test_on_trial_the_learners_own_model_is_served_which_is_from_before() -> None:
-    life = Life()
-    life.go(100)
-    kept = life.go(5, "sensor_stuck")
-    assert kept < 100
-    assert life.go(5, "sensor_stuck", distrusts=True) == life.number
-
-
 @pytest.mark.parametrize("trouble", ["", "nothing_learnt"])
 def test_a_model_that_is_not_fit_is_served_during_no_trouble(trouble: str) -> None:
     """Also where the trouble lets the newest one answer."""
@@ -208,12 +172,3 @@ def test_a_state_goes_on_alike() -> None:
     restore(other.choice, save(life.choice))
     other.choice.keep(life.choice.models())
     assert [life.go(30), life.choice.trust] == [other.go(30), other.choice.trust]
-
-
-def test_what_the_learner_serves_is_known_as_the_identified_model() -> None:
-    assert is_identified(replace(IDENTIFIED, noise_variance=0.5, seq=7), IDENTIFIED)
-    assert not is_identified(model(1), IDENTIFIED)
-    assert not is_identified(replace(IDENTIFIED, alpha=IDENTIFIED.alpha + 1.0), IDENTIFIED)
-    line = make_models()["linear"]
-    assert is_identified(line, line)
-    assert not is_identified(line, IDENTIFIED)

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import time
-import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +34,7 @@ from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 from tests.online_models import PlainModel
-from tests.service.background.test_diagnosing_parts import DT_S, batch
+from tests.service.background.test_diagnosing_parts import DT_S
 from tests.service.living import eventually
 
 #: The jobs run at the lowest priority: beside other work they would not be done in time.
@@ -111,18 +110,6 @@ def test_what_is_recent_is_looked_at_though_a_longer_part_lies_before_a_gap(mode
     assert told["verdict"] == "changed"
     assert told["effects"][0]["name"] == "gain_drift"
     assert told["effects"][0]["parameters"]["gain"] == pytest.approx(-0.03, abs=0.004)
-
-
-def test_a_job_does_not_keep_what_it_was_given(model_file: Path) -> None:
-    samples = [recorded(model_file, 3.0, 0.0) for _ in range(2)]
-    known = [weakref.ref(each) for each in samples]
-    told: list[dict[str, Any]] = []
-    job = diagnosis_job(order(model_file, 0), *samples, 60.0, told.append)
-    samples.clear()
-    job.start()
-    eventually(lambda: not job.running, 60.0)
-    assert job.result == told[0]
-    assert all(each() is None for each in known)
 
 
 def test_a_job_that_cannot_be_done_says_why(model_file: Path, tmp_path: Path) -> None:
@@ -234,22 +221,6 @@ def test_an_alarm_with_too_few_samples_after_it_waits_for_more(model_file: Path)
     watcher.close()
 
 
-def test_waiting_for_samples_ends_when_what_was_before_the_alarm_is_pushed_out(model_file: Path) -> None:
-    samples = recorded(model_file, 18.0, 6.0, gain_drift__gain=-0.03)
-    watcher, axis = alarmed(model_file, samples)
-    # From now on the stage says something for a tenth of a second in each.
-    events: list[str] = []
-    for first in range(7900, 17000, 1000):
-        feed(watcher, samples, first, first + 100)
-        eventually(lambda: not watcher.status()["running"], 60.0)
-        events += [e["event"] for e in axis.take_events()]
-    assert events == ["diagnosis_waits", "diagnosis_failed"]
-    status = watcher.status()
-    assert (status["started"], status["waited"], status["failed"], status["running"]) == (2, 1, 1, False)
-    assert status["last"]["text"].startswith("no verdict: recent: got ")
-    watcher.close()
-
-
 def test_requests_are_answered_at_once_and_one_runs_at_a_time(model_file: Path) -> None:
     samples = recorded(model_file, 13.0, 0.0)
     watcher, axis, _ = watched(model_file)
@@ -269,14 +240,6 @@ def test_requests_are_answered_at_once_and_one_runs_at_a_time(model_file: Path) 
     assert watcher.status()["last"]["verdict"] == "unchanged"
     assert axis.take_events()[-1]["event"] == "diagnosis"
     watcher.close()
-    assert not watcher.request({})["started"]
-
-
-def test_a_stage_that_rests_gives_no_reference(model_file: Path) -> None:
-    watcher, _, _ = watched(model_file)
-    for first in range(0, 9000, 100):
-        watcher.take(batch(first, 100, y_um=40.0))
-    assert not watcher.status()["reference"]
     assert not watcher.request({})["started"]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dehyst.service.background.settings import WatchConfig
-from dehyst.service.background.watcher import Alarm, Levels, SampleBuffer
+from dehyst.service.background.watcher import Alarm, Levels
 from dehyst.service.config.settings import parse_config
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.samples import SampleBatch
@@ -23,30 +23,6 @@ def batch(first: int, n: int, y_um: float = 1.0) -> SampleBatch:
 
 
 # ---- buffer
-
-
-@pytest.mark.parametrize("sizes", [(3, 4, 5), (1,) * 20, (50,), (9, 10, 11)])
-def test_the_buffer_keeps_the_newest_in_order(sizes: tuple[int, ...]) -> None:
-    buffer, first = SampleBuffer(10), 0
-    for n in sizes:
-        assert buffer.add(batch(first, n))
-        first += n
-    kept = buffer.copy()
-    assert kept[0].tolist() == list(range(max(0, first - 10), first))
-    assert kept[2].tolist() == pytest.approx((0.1 * kept[0]).tolist())
-    assert buffer.copy(4)[0].tolist() == kept[0, -4:].tolist()
-    assert (buffer.size, buffer.last_seq) == (min(10, first), first - 1)
-
-
-def test_doubles_are_left_out_and_a_restart_begins_anew() -> None:
-    buffer = SampleBuffer(1000)
-    buffer.add(batch(0, 500))
-    assert buffer.add(batch(490, 20))
-    assert buffer.copy()[0].tolist() == list(range(510))
-    assert buffer.add(batch(0, 150))
-    assert buffer.size == 510
-    assert not buffer.add(batch(150, 150))
-    assert buffer.copy()[0].tolist() == list(range(150, 300))
 
 
 # ---- alarm
@@ -71,14 +47,6 @@ def test_an_alarm_needs_to_last(now: Levels, word: str) -> None:
     assert alarm.check(1.4, NORMAL) == ""
     assert alarm.check(1.6, now) == ""
     assert word in alarm.check(2.1, now)
-
-
-def test_what_stays_within_its_bounds_raises_none() -> None:
-    alarm = Alarm(WatchConfig(), 10.0)
-    alarm.arm(NORMAL)
-    assert all(alarm.check(0.1 * k, Levels(1.009, 0.19, 0.19, True)) == "" for k in range(100))
-    assert Levels.of({"gain": float("nan"), "offset_V": 0.0, "recent_rms_error_pct": 1.0}) is None
-    assert Levels.of({"gain": 1.0}) is None
 
 
 # ---- configuration

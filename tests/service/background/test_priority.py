@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from dehyst.service.background import job as priority
-
 AUTOGROUP = Path("/proc/self/autogroup")
 autogroups = pytest.mark.skipif(
     not AUTOGROUP.exists() or not AUTOGROUP.read_text(), reason="this system does not share by sessions"
@@ -50,42 +48,3 @@ def test_a_session_of_its_own_is_as_nice_as_the_process() -> None:
 def test_a_session_that_is_anothers_stays_as_it_was() -> None:
     _, before, after = stepped(own_session=False)
     assert after == before
-
-
-class Busy:
-    """A system that takes the wish the third time only."""
-
-    def __init__(self, refusal: type[OSError], times: int) -> None:
-        self.refusal, self.times, self.wishes = refusal, times, []
-
-    def write_text(self, text: str, encoding: str) -> None:
-        self.wishes.append(text)
-        if len(self.wishes) <= self.times:
-            raise self.refusal
-
-
-@pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if this process had a session of its own; how nice it is stays."""
-    monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
-    monkeypatch.setattr(os, "nice", lambda _: 0)
-    monkeypatch.setattr(priority, "_PAUSE_S", 0.0)
-
-
-@pytest.mark.usefixtures("alone")
-def test_a_system_that_was_asked_a_moment_ago_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = Busy(BlockingIOError, 2)
-    monkeypatch.setattr(priority, "_AUTOGROUP", busy)
-    priority.step_back()
-    assert busy.wishes == ["19"] * 3
-
-
-@pytest.mark.usefixtures("alone")
-@pytest.mark.parametrize(("refusal", "asked"), [(BlockingIOError, 20), (PermissionError, 1), (FileNotFoundError, 1)])
-def test_a_system_that_refuses_is_left_in_peace(
-    monkeypatch: pytest.MonkeyPatch, refusal: type[OSError], asked: int
-) -> None:
-    busy = Busy(refusal, 1000)
-    monkeypatch.setattr(priority, "_AUTOGROUP", busy)
-    priority.step_back()
-    assert len(busy.wishes) == asked

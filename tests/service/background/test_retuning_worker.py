@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-import weakref
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -128,32 +126,6 @@ def retuner(monkeypatch: pytest.MonkeyPatch) -> Iterator[Retuner]:
     made = Retuner(RetuningConfig(period_s=0.0, fresh=100))
     yield made
     made.close()
-
-
-def test_one_that_stands_down_lets_go_of_its_learner(retuner: Retuner) -> None:
-    """It takes the state of the one that serves: two learners are megabytes that nobody needs."""
-
-    class Teaching:
-        seq = 5000
-
-        def counters(self) -> dict[str, int]:
-            return {"learnt": 900}
-
-        def window_data(self) -> WindowData:
-            return window_data(50)
-
-    axis: Any = SimpleNamespace(dt_s=DT_S, learner=Teaching(), learning=True, frozen=False)
-    retuner.request({})
-    retuner.step(axis)
-    assert retuner.status()["state"] == "proposing"
-    before = weakref.ref(axis.learner)
-    axis.learner = Teaching()
-    retuner.leave()
-    assert before() is None
-    # Serving again it drops what was under way, and can begin anew.
-    retuner.step(axis)
-    assert (retuner.status()["state"], retuner.status()["dropped"]) == ("idle", 1)
-    assert retuner.request({})["started"] is True
 
 
 def test_the_thread_that_learns_only_copies(

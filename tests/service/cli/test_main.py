@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from dehyst.lab.cli import COMMANDS, main
-from dehyst.service.cli.main import COMMANDS as SERVICE_COMMANDS
 from dehyst.service.cli.main import GROUPS, build_parser
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,13 +41,6 @@ def test_every_documented_command_is_there_with_help_and_a_log_level(
         assert "--log-level" in text
 
 
-def test_numbers_have_units(parsers: dict[str, argparse.ArgumentParser]) -> None:
-    for name, parser in parsers.items():
-        for action in parser._actions:
-            if action.type is float and action.metavar == "S":
-                assert re.search(r"\bs\b", action.help or ""), (name, action.option_strings)
-
-
 def test_help_lists_all_commands_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
@@ -58,22 +50,6 @@ def test_help_lists_all_commands_in_groups(capsys: pytest.CaptureFixture[str]) -
     assert places == sorted(places)
     for name in COMMANDS:
         assert re.search(rf"^  {name} ", text, re.MULTILINE)
-
-
-def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--version"])
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith("dehyst")
-
-
-def test_the_service_alone_has_no_experiments() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "dehyst.service.cli", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert "serve" in done.stdout
-    assert "soak" not in done.stdout
-    assert set(SERVICE_COMMANDS) < set(COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -94,19 +70,6 @@ def test_completion_knows_commands_and_options(shell: str, capsys: pytest.Captur
     script = capsys.readouterr().out
     for word in ("ask-diagnosis", "standby", "log-level"):
         assert word in script
-
-
-def test_bash_completes_from_the_script(tmp_path: Path) -> None:
-    script = tmp_path / "dehyst.bash"
-    command = [sys.executable, "-m", "dehyst.lab.cli", "completion", "bash"]
-    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    script.write_text(printed, encoding="utf-8")
-    ask = (
-        f'source {script}; COMP_WORDS=(dehyst serve --st); COMP_CWORD=2; COMP_LINE="dehyst serve --st"; '
-        'COMP_POINT=${#COMP_LINE}; _shtab_dehyst; echo "${COMPREPLY[@]}"'
-    )
-    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=False)
-    assert done.stdout.split() == ["--standby"], done.stderr
 
 
 @pytest.mark.parametrize("encoding", ["cp932", "ascii"])

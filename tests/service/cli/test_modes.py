@@ -44,17 +44,6 @@ def test_modes_writes_a_report(recordings: list[str], tmp_path: Path, capsys: py
         assert (out / name).stat().st_size > 10_000
 
 
-def test_modes_prints_json_and_no_pictures(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    args = ["modes", recordings[0], "--out", str(out), "--start-modes", "4", "--quiet", "--json", "--no-pictures"]
-    assert main(args) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert [round(mode["frequency_hz"][0]) for mode in data["modes"]] == [90, 229]
-    assert not (out / "response.png").exists()
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [

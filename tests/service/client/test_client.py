@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
 import sys
 import threading
 import time
@@ -31,7 +30,7 @@ from dehyst.service.protocol.errors import (
     error_to_json,
 )
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
+from dehyst.service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE
 from dehyst.service.runtime.session import open_client, open_service
 from dehyst.service.security.authenticator import own_authenticator
 
@@ -72,22 +71,6 @@ def test_points_and_trajectories_continue_each_other(client: Client) -> None:
     np.testing.assert_allclose(client.trajectory(y).u_V, whole.u_V, atol=1e-9)
 
 
-def test_the_slew_limit_counts_from_the_answer_before(client: Client) -> None:
-    low = client.point(10.0)
-    high = client.point(80.0, after=low)
-    assert high.flags & LIMITED_SLEW
-    assert high.u_V == pytest.approx(low.u_V + client.limits.slew_V_per_s * client.dt_s)
-
-
-def test_the_models_beside_answer_by_name(client: Client) -> None:
-    line = client.trajectory([12.0, 23.0], model="linear")
-    assert line.model == "linear"
-    assert line.u_V.tolist() == pytest.approx([1.0, 2.0])
-    assert line.memory.size == 0
-    with pytest.raises(RefusedError, match="expected one of linear, lssvm_adaptive"):
-        client.point(12.0, model="mpi")
-
-
 def test_as_of_waits_for_what_is_still_being_learnt(client: Client) -> None:
     first = next_seq(client)
     teach(client, first, 200)
@@ -100,19 +83,6 @@ def test_as_of_waits_for_what_is_still_being_learnt(client: Client) -> None:
         feeder.join()
     with pytest.raises(BehindError, match="as_of"):
         client.trajectory([40.0], as_of=first + 5000, wait_s=0.05)
-
-
-def test_a_simulation_that_outruns_the_learner_waits_for_it(client: Client) -> None:
-    """As fast as it can be: each block waits until the service has learnt the one before."""
-    first, n = next_seq(client), 400
-    for begin in range(first, first + 10 * n, n):
-        teach(client, begin, n)
-        assert client.wait_learnt(begin + n - 1, 20.0) >= begin + n - 1
-        assert client.status()["seq"] == begin + n - 1
-    before = time.monotonic()
-    with pytest.raises(BehindError, match=f"sample {first + 10 * n}.*samples must come"):
-        client.wait_learnt(first + 10 * n, 0.2)
-    assert time.monotonic() - before < 5.0
 
 
 def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -> None:
@@ -167,20 +137,6 @@ def test_a_lost_whole_model_is_fetched_and_the_follower_is_at_the_last_sample(cl
     follower.close()
 
 
-def test_the_follower_passes_to_the_baseline_outside_the_domain_as_the_service_does(client: Client) -> None:
-    follower = client.follow("lssvm_adaptive", deltas=False)
-    y, v = np.full(40, 40.0), np.linspace(0.0, 70_000.0, 40)
-    asked = client.trajectory(
-        y, v, np.zeros(40), memory=follower.memory, model="lssvm_adaptive", as_of=max(0, follower.snapshot_seq)
-    )
-    assert asked.stand_in == "linear"
-    assert {BLENDED, STAND_IN} <= set((asked.flags & (BLENDED | STAND_IN)).tolist())
-    u, flags = follower.trajectory(y[:15], v[:15], np.zeros(15))
-    ones = [follower.point(*point) for point in zip(y[15:].tolist(), v[15:].tolist(), strict=True)]
-    np.testing.assert_array_equal(np.concatenate([u, ones]), asked.u_V)
-    np.testing.assert_array_equal(flags & ~np.uint8(STALE), asked.flags[:15])
-
-
 def test_commands_leave_within_the_limits_and_say_so_and_references_arrive(client: Client) -> None:
     got: list[float] = []
     wanted: list[wire.Block] = []
@@ -216,22 +172,6 @@ def test_the_follower_guards_what_leaves_too(client: Client) -> None:
             follower.trajectory([y_um, y_um], [v, v])
     with pytest.raises(RefusedError, match="sorcery"):
         client.follow("sorcery")
-
-
-def test_what_is_not_even_sent(client: Client) -> None:
-    for bad in ({"y_um": []}, {"y_um": [1.0, 2.0], "v_um_per_s": [1.0]}, {"y_um": [[1.0, 2.0]]}, {"y_um": ["a"]}):
-        with pytest.raises((InputError, ValueError)):
-            client.trajectory(**bad)
-    with pytest.raises(InputError, match="u_V"):
-        client.command(0, [float("nan")])
-    with pytest.raises(InputError, match="seq"):
-        client.reference(-1, [1.0])
-
-
-def test_the_key_may_be_a_text(shared_service: Any) -> None:
-    path = str(own_authenticator().path)
-    with Client.connect(shared_service.endpoint, timeout_s=5.0, key=path) as client:
-        assert client.point(40.0).u_V > 0.0
 
 
 @pytest.mark.parametrize("wrong", ["40", [1.5]], ids=repr)
@@ -296,12 +236,6 @@ def test_a_service_that_does_not_answer_in_time(free_port: int) -> None:
                 Client.connect(endpoint, timeout_s=0.2)
         finally:
             release.set()
-
-
-def test_a_service_that_answers_nothing_is_no_service(free_port: int) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    with open_service([endpoint]), pytest.raises(NoReplyError, match="no reply within"):
-        Client.connect(endpoint, timeout_s=2.0)
 
 
 def ask_until_unanswered(client: Client) -> None:
@@ -379,16 +313,6 @@ def test_the_command_asks_a_running_service(
         code, _, complaint = query(*args)
         assert code == 2, args
         assert words in complaint
-
-
-def test_the_command_as_a_process_ends_with_a_status(free_port: int) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-m", "dehyst.lab.cli", "query", "12", "--endpoint", f"tcp/127.0.0.1:{free_port}"],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert ended.returncode == 2
-    assert "start 'dehyst serve' there" in ended.stderr
-    assert "Traceback" not in ended.stderr
 
 
 def test_no_command_of_a_burst_is_dropped(client: Client, shared_service: Any) -> None:

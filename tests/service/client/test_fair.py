@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from dehyst.service.client.client import Client
-from dehyst.service.failover.state_transfer import status_of
 from dehyst.service.protocol.errors import BusyError, RefusedError, error_from_json
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import encode_query
 from dehyst.service.runtime.session import open_client, open_service
-from dehyst.service.security.authenticator import own_authenticator
 
 pytestmark = pytest.mark.e2e
 N = 40_000
@@ -64,15 +62,6 @@ def test_parameters_that_nobody_knows_are_refused_once(client: Client, selector:
     said = json.loads(replies[0].err.payload.to_bytes())
     assert said["field"] == "parameter"
     assert repr(selector.split("?")[1].split("=")[0]) == said["got"]
-
-
-def test_another_instance_asked_for_a_sign_of_life_gives_none(client: Client) -> None:
-    by, key = own_authenticator(), client.keys.status
-    instance = str(client.status()["instance"])
-    assert status_of(client._session, key, "somebody", 0.5, by) is None
-    found = status_of(client._session, key, instance, 5.0, by)
-    assert found is not None
-    assert found["instance"] == instance
 
 
 def test_more_points_than_configured_are_refused(serve: Any) -> None:

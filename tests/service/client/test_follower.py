@@ -23,7 +23,6 @@ from dehyst.service.protocol.query import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
-    NOT_FINITE_REPLACED,
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
@@ -154,27 +153,6 @@ def test_a_snapshot_that_is_no_longer_renewed_is_told_point_by_point() -> None:
     session.publish(payload)
     follower.point(40.0)
     assert follower.last_flags == 0
-
-
-def test_what_is_refused_leaves_what_was_told_as_it_was() -> None:
-    follower, _ = one_by_one(make_axis(), "linear", (np.array([149.0, 149.0]), np.zeros(2)))
-    before = (follower.last_flags, follower.last_std_V, follower.source)
-    assert before[0] & LIMITED_VOLTAGE
-    with pytest.raises(InputError):
-        follower.point(200.0)
-    assert (follower.last_flags, follower.last_std_V, follower.source) == before
-
-
-def test_a_voltage_that_nobody_gave_has_no_source() -> None:
-    """A model whose answer is not finite, and nobody to stand in: the voltage before is held."""
-    model = make_models()["lssvm_adaptive"]
-    payload = encode_model("lssvm_adaptive", model, 5, model.rest_memory(40.0), Safety(True))
-    follower = Follower(Session(), None, "lssvm_adaptive", lambda: payload, LIMITS)  # type: ignore[arg-type]
-    held = follower.point(40.0)
-    follower.memory = np.full(model.memory_size, math.nan)
-    assert follower.point(41.0) == held
-    assert follower.last_flags & NOT_FINITE_REPLACED
-    assert follower.source == ""
 
 
 def moved(n: int) -> tuple[Any, FloatArray, FloatArray]:

@@ -162,9 +162,3 @@ def test_a_command_says_what_to_install(arguments: list[str], without: str, pack
     assert done.returncode == 2
     assert f"needs the package {package}" in done.stderr
     assert f"pip install 'dehyst[{extras}]'" in done.stderr
-
-
-@pytest.mark.parametrize("arguments", [["query", "--help"], ["router", "--help"]])
-def test_the_commands_of_a_client_need_nothing_else(arguments: list[str]) -> None:
-    done = run_without(OTHERS, COMMAND, *arguments)
-    assert done.returncode == 0, done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,22 +9,15 @@ import pytest
 
 from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.fallback import FADE_S
-from dehyst.service.client.client import UNDER_WAY, Client, continued, pending_before, with_pending
+from dehyst.service.client.client import Client, pending_before, with_pending
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.query import (
-    MAX_PENDING,
     Answer,
     FeedforwardQuery,
     Pending,
     Trajectory,
-    encode_query,
 )
 from tests.service.server.test_axis import make_axis, parts, recording
-
-
-def test_unequal_columns_are_refused_before_they_are_sent() -> None:
-    with pytest.raises(FieldError, match=r"pending.u_V"):
-        encode_query(1.0, 2.0, pending=Pending(0, np.zeros(3), np.zeros(2)))
 
 
 def motion(first: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -108,31 +100,6 @@ def test_answers_put_what_is_under_way_together() -> None:
         is pending_before(two, 10_000)
         is None
     )
-
-
-@pytest.mark.parametrize(
-    ("answers", "last_seen", "kept"),
-    [(60, None, UNDER_WAY), (60, 400, 920), (300, 400, MAX_PENDING), (3, 60, 80)],
-    ids=["samples come", "none since 400", "none for longer than a query holds", "not so many were commanded"],
-)
-def test_all_that_no_sample_was_seen_of_is_kept(answers: int, last_seen: int | None, kept: int) -> None:
-    long, begin = answer_of(100, np.arange(20.0)), 120
-    for k in range(answers):
-        long = answer_of(begin, np.full(20, float(k)), long, begin - 40 if last_seen is None else last_seen)
-        begin += 20
-    under = pending_before(long, begin)
-    assert under is not None
-    assert (under.first, under.y_um.size, under.u_V.size) == (begin - kept, kept, kept)
-
-
-def test_a_query_with_a_beginning_takes_the_voltage_before_from_what_is_pending_before() -> None:
-    one = answer_of(100, np.arange(1.0, 21.0))
-    asked = continued(None, "", math.nan, one, 110)
-    assert (asked["memory"], asked["model"], asked["u_before_V"]) == (None, "m", pytest.approx(1.0))
-    assert continued(None, "", 5.0, one, 110)["u_before_V"] == 5.0
-    assert math.isnan(continued(None, "", math.nan, None, 0)["u_before_V"])
-    with pytest.raises(FieldError, match="begin"):
-        continued(np.zeros(3), "", math.nan, one, 110)
 
 
 @pytest.mark.e2e

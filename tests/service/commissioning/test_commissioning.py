@@ -24,13 +24,11 @@ from dehyst.service.adapters.adapter import AdapterError, Stated
 from dehyst.service.adapters.pi import PiStage
 from dehyst.service.adapters.simulated_pi import FAULTS, SimulatedPi
 from dehyst.service.answers.guard import Limits
-from dehyst.service.cli.main import main
 from dehyst.service.commissioning import commission as rounds
 from dehyst.service.commissioning import mover
 from dehyst.service.commissioning.commission import commission, response
 from dehyst.service.commissioning.mover import Order, Piece, StageFault
 from dehyst.service.config.settings import read_config
-from dehyst.service.runtime.stopping import STOPS
 from dehyst.service.storage.model_file import read_bundle
 from tests.service.conftest import Clock, unused_port
 
@@ -136,26 +134,6 @@ def test_noise_fifty_times_too_large_stands_in_the_way(tmp_path: Path, monkeypat
     assert report["rounds"] == 1
     assert read_bundle(tmp_path / "stage.npz").models
     kept_within(written, LIMITS, 50.0)
-
-
-@needs_pipython
-@pytest.mark.e2e
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipython leaves its socket open
-def test_a_controller_that_is_gone_leaves_its_voltage_and_that_is_said(tmp_path: Path) -> None:
-    written: list[float] = []
-    with controller() as (process, port):
-        open_stage = opener(port, written)
-
-        def say(line: str) -> None:
-            if line.startswith("motion seen"):
-                process.kill()
-
-        report = commission(open_stage, Order(LIMITS), tmp_path, say=say)
-    assert report["fault"]["kind"] == "failed"
-    assert report["fault"]["rest"].startswith("NOT at rest: ")
-    assert "no controller answers there" in report["fault"]["rest"]
-    assert "the voltage stays, last known at" in report["fault"]["rest"]
 
 
 def stage_file(folder: Path, port: int) -> list[str]:
@@ -368,20 +346,6 @@ def test_opening_writes_nothing_and_limits_that_do_not_fit_are_refused(clock: Cl
         commission(lambda: 3, Order(LIMITS), tmp_path)  # type: ignore[arg-type,return-value]
 
 
-def test_results_of_before_stay_where_no_stage_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mine.py").write_text("def open_stage():\n    raise OSError('no such device')\n")
-    (tmp_path / "report.json").write_text("{}")
-    words = ["--adapter", f"{tmp_path / 'mine.py'}:open_stage", "--u-min", "0", "--u-max", "80", "--slew", "10"]
-    before = {number: signal.getsignal(number) for number in STOPS}
-    try:
-        assert main(["commission", *words, "--out", str(tmp_path)]) == 2
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    assert "open_stage: OSError: no such device" in capsys.readouterr().err
-    assert (tmp_path / "report.json").read_text() == "{}"
-
-
 def test_sign_and_unit_are_checked_against_what_is_stated(clock: Clock, tmp_path: Path) -> None:
     stage = Direct(said=Stated(False, "nm", 1e5))
     assert faulty(stage, tmp_path)["message"].startswith("the controller gives positions in 'nm', expected µm")
@@ -422,22 +386,6 @@ def test_a_stage_that_does_not_move_rings_or_has_no_reading_is_named(clock: Cloc
     assert faulty(blind, tmp_path)["kind"] == "no_reading"
 
 
-def test_a_refused_voltage_ends_it_and_the_stage_goes_back(clock: Clock, tmp_path: Path) -> None:
-    stage = Direct()
-    stage.controller._high_V = 50.0
-    fault = faulty(stage, tmp_path)
-    assert (fault["kind"], fault["rest"]) == ("failed", "back at rest, 0 V")
-    assert "SVA: error 302" in fault["message"]
-    assert stage.applied_V() == 0.0
-
-
-def test_the_longest_time_ends_the_first_round(clock: Clock, tmp_path: Path) -> None:
-    stage = Direct()
-    fault = faulty(stage, tmp_path, Order(LIMITS, duration_s=30.0))
-    assert (fault["kind"], fault["rest"]) == ("time", "back at rest, 0 V")
-    assert clock.now_s < 132.0
-
-
 def test_a_sweep_shows_lag_and_first_mode() -> None:
     from scipy.signal import cont2discrete
 
@@ -460,3 +408,32 @@ def test_a_sweep_shows_lag_and_first_mode() -> None:
     assert lag_s == pytest.approx((late + 0.5) / rate_Hz + 0.1 / w, abs=2e-4)
     still = Piece(np.arange(t.size), u_V, np.random.default_rng(2).normal(0.0, 0.005, t.size), timely)
     assert response(still, slice(0, t.size), 1.0 / rate_Hz) == (None, None)
+
+
+@needs_pipython
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipython leaves its socket open
+def test_a_controller_that_is_gone_leaves_its_voltage_and_that_is_said(tmp_path: Path) -> None:
+    written: list[float] = []
+    with controller() as (process, port):
+        open_stage = opener(port, written)
+
+        def say(line: str) -> None:
+            if line.startswith("motion seen"):
+                process.kill()
+
+        report = commission(open_stage, Order(LIMITS), tmp_path, say=say)
+    assert report["fault"]["kind"] == "failed"
+    assert report["fault"]["rest"].startswith("NOT at rest: ")
+    assert "no controller answers there" in report["fault"]["rest"]
+    assert "the voltage stays, last known at" in report["fault"]["rest"]
+
+
+def test_a_refused_voltage_ends_it_and_the_stage_goes_back(clock: Clock, tmp_path: Path) -> None:
+    stage = Direct()
+    stage.controller._high_V = 50.0
+    fault = faulty(stage, tmp_path)
+    assert (fault["kind"], fault["rest"]) == ("failed", "back at rest, 0 V")
+    assert "SVA: error 302" in fault["message"]
+    assert stage.applied_V() == 0.0

@@ -9,11 +9,8 @@ from pathlib import Path
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.service.config.reference import example, page
-from dehyst.service.config.schema import build_settings
 from dehyst.service.config.settings import parse_config, read_config
-from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.session import check_endpoint, is_loopback
 
 GOOD = """
@@ -139,11 +136,3 @@ def test_loopback_is_told_from_the_rest(endpoint: str, local: bool) -> None:
 def test_bad_endpoints_are_refused(endpoint: object) -> None:
     with pytest.raises(InputError, match="listen"):
         check_endpoint("listen", endpoint)
-
-
-@pytest.mark.parametrize(("table", "key", "known"), [("solver", "backend", "accuracy"), ("drift", "algebra", "noise")])
-def test_a_setting_that_no_longer_exists_is_refused_by_name(table: str, key: str, known: str) -> None:
-    with pytest.raises(FieldError) as refused:
-        build_settings(LearnerConfig, {table: {key: "compiled"}}, "axis[0].learner")
-    assert f"axis[0].learner.{table}.{key}" in str(refused.value)
-    assert known in str(refused.value)

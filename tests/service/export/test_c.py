@@ -17,7 +17,7 @@ from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.answering import derivatives
 from dehyst.service.answers.guard import Limits, limit_voltage
 from dehyst.service.export.c_source import domain
-from dehyst.service.export.exporting import Frozen, trial_motion, voltages, write_export
+from dehyst.service.export.exporting import Frozen, voltages, write_export
 from dehyst.service.protocol.model import decode_model
 from tests.service.export.compiled import STRICT, Run, compiled, needs_a_compiler
 
@@ -120,14 +120,6 @@ def test_the_limits_are_those_of_the_service(before: float, tmp_path: Path) -> N
         before, expected = limit_voltage(wanted, before, LIMITS.u_min_V, LIMITS.u_max_V, LIMITS.slew_V_per_s * 1e-3)
         assert float(u) == pytest.approx(before, abs=1e-12)
         assert int(flags) & 3 == expected & 3
-
-
-def test_one_axis_more_is_one_state_more() -> None:
-    """Nothing is kept outside the state: two runs of one library are alike."""
-    run, _, _ = in_c("lssvm")
-    motion = trial_motion(frozen_of("lssvm"))
-    first, second = run(*motion)[0], run(*motion)[0]
-    assert first.tobytes() == second.tobytes()
 
 
 @pytest.mark.parametrize("flags", [(), ("-DIT_SINGLE",)], ids=["double", "single"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import pytest
 from dehyst.lab.cli import main
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
-from dehyst.service.export.exporting import Frozen, Periodic, trial_motion, voltages, write_export
+from dehyst.service.export.exporting import Frozen, trial_motion, voltages, write_export
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, ServeProcess, make_models
 from tests.service.export.compiled import STRICT, needs_a_compiler
@@ -54,15 +53,6 @@ def test_the_table_has_the_stated_error_on_its_motion(tmp_path: Path) -> None:
     assert np.abs(off).max() < 0.01
     wave = np.loadtxt(tmp_path / "it_wave.txt")
     np.testing.assert_allclose(wave, u, atol=1e-3)
-
-
-def test_half_of_the_motion_is_told_to_be_another_loop() -> None:
-    """A table knows one loop: with hysteresis, an inner one is far off, and the number says so."""
-    frozen = Frozen(make_models()["lssvm_adaptive"], LIMITS, "it", "")
-    whole = Periodic.of(frozen, 10.0, 70.0, 1.0)
-    line = Frozen(make_models()["linear"], LIMITS, "it", "")
-    assert whole.error_V(whole) < whole.error_V(Periodic.of(frozen, 25.0, 55.0, 1.0))
-    assert Periodic.of(line, 10.0, 70.0, 1.0).error_V(Periodic.of(line, 25.0, 55.0, 1.0)) < 1e-9
 
 
 @needs_a_compiler
@@ -106,17 +96,6 @@ def test_the_fmu_is_the_model(tmp_path: Path) -> None:
     assert got["u_V"][0] == pytest.approx(expected[0], abs=1e-12)
     with pytest.raises(fmpy.fmi1.FMICallException):
         fmpy.simulate_fmu(str(path), stop_time=0.1, step_size=1.4 * DT_S, output_interval=1.4 * DT_S)
-
-
-@needs_a_compiler
-def test_an_fmu_holds_its_description_and_library(tmp_path: Path) -> None:
-    write_export(Frozen(make_models()["linear"], LIMITS, "it", ""), tmp_path, None, 1.0, fmu=True)
-    with zipfile.ZipFile(tmp_path / "it.fmu") as archive:
-        assert archive.namelist() == ["modelDescription.xml", "binaries/linux64/it.so"]
-        text = archive.read("modelDescription.xml").decode()
-        guid = re.findall(r'guid="([0-9a-f-]{36})"', text)
-        assert guid[0].encode() in archive.read("binaries/linux64/it.so")
-    assert 'modelIdentifier="it"' in text
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:

@@ -12,11 +12,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.types import FloatArray
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.lab.cli import main
-from dehyst.service.identification import identifying
 from dehyst.service.identification.identifying import (
     NAMES,
     Stretch,
@@ -26,9 +23,8 @@ from dehyst.service.identification.identifying import (
     split_at,
     thinning,
 )
-from dehyst.service.identification.recording_options import parse_range
 from dehyst.service.storage.model_file import read_bundle
-from dehyst.sim.recordings import Recording, Repaired, repaired
+from dehyst.sim.recordings import Recording, Repaired
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
@@ -118,19 +114,6 @@ def test_nothing_is_learnt_from_the_held_out_part() -> None:
     np.testing.assert_allclose(scores[0][0] - scores[1][0], 1.0)
 
 
-def test_filled_in_samples_are_not_scored() -> None:
-    recording = made_recording(4.0)
-    keep = np.ones(len(recording), dtype=bool)
-    keep[1800:1810] = False
-    holed = Recording(recording.t_s[keep], recording.u_V[keep], recording.y_um[keep], recording.dt_s)
-    whole = Stretch.of(repaired(holed))
-    train, test = whole.part(0, 1500), whole.part(1500, len(whole))
-    (found,) = identify_all(train, test, recording.dt_s, follows=True, names=("linear",))
-    assert np.flatnonzero(np.isnan(found.error_V)).tolist() == list(range(300, 310))
-    assert found.score is not None
-    assert np.isfinite(found.score.max_V)
-
-
 def test_a_model_that_cannot_be_identified_does_not_take_the_others_along() -> None:
     recording = made_recording(4.0)
     falling = Stretch(recording.u_V, -recording.y_um, -motion_of(recording), np.ones(len(recording), dtype=np.bool_))
@@ -188,15 +171,6 @@ def test_a_recording_without_units_is_refused_and_an_option_mends_it(
     assert "linear" in capsys.readouterr().out
 
 
-def test_parse_range() -> None:
-    assert parse_range("--range", "2:40") == (2.0, 40.0)
-    assert parse_range("--range", ":40") == (None, 40.0)
-    assert parse_range("--range", None) == (None, None)
-    for bad in ("2", "5:2", "a:b", "3:3"):
-        with pytest.raises(InputError, match="--range"):
-            parse_range("--range", bad)
-
-
 def test_measured_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A piezo stack at 1 Hz; its capacitive sensor lies one sample late. Judged on the last quarter."""
     path = DATA / "picma_stack" / "model_sine_1hz.csv"
@@ -246,30 +220,6 @@ def test_a_long_recording_is_thinned_and_served_at_its_own_rate() -> None:
         assert fine.score is not None
         assert coarse.score is not None
         assert coarse.score.rmse_pct < 1.3 * fine.score.rmse_pct + 0.02
-
-
-@pytest.mark.parametrize(("train", "fits"), [(9000, 1), (3000, 2)])
-def test_bouc_wen_is_fitted_once_where_the_beginning_is_all_it_takes(
-    train: int, fits: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a long recording it takes the beginning, which is the same without the held-out end and with it."""
-    dt_s, n = 1e-3, 12_000
-    t_s = np.arange(n) * dt_s
-    u_V = 4.0 - 4.0 * np.cos(2 * np.pi * 1.5 * t_s) * np.exp(-0.1 * t_s)
-    y_um = MpiParameters((0.0, 1.0, 2.0), (7.0, 1.5, 1.0), (0.0, 30.0), (1.0, -0.1)).simulate(u_V, dt_s)
-    whole = Stretch.of(Repaired(Recording(t_s, u_V, y_um, dt_s), np.ones(n, dtype=np.bool_), ()))
-    taken: list[int] = []
-
-    def fitted(u: FloatArray, *more: Any, **named: Any) -> Any:
-        taken.append(u.size)
-        return (identifying.fit_linear(u, *more, **named)[0],)
-
-    monkeypatch.setattr(identifying, "fit_bouc_wen", fitted)
-    identify_all(
-        whole.part(0, train), whole.part(train, n), dt_s, follows=True, whole=whole, names=("bouc_wen",), most=1000
-    )  # fmt: skip
-    assert len(taken) == fits
-    assert max(taken) <= 1000
 
 
 def test_a_tilt_is_identified_in_microradians_and_the_model_file_says_so(

@@ -9,11 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dehyst.adaptive.errors import ModelFileError
-from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.state import restore, save
 from dehyst.adaptive.types import InverseModel
-from dehyst.service.intake.sequence import RESYNC_AFTER, SET_AFTER, SampleClock
+from dehyst.service.intake.sequence import SET_AFTER, SampleClock
 from dehyst.service.protocol.samples import SampleBatch
 from tests.service.server.test_axis import make_axis, recording
 
@@ -56,17 +53,6 @@ def test_a_stage_that_counts_anew_goes_on_at_once_and_lost_samples_are_time() ->
     assert clock.sets == 0
 
 
-def test_it_goes_on_from_its_state_and_refuses_a_damaged_one() -> None:
-    one, two = SampleClock(DT_S), SampleClock(DT_S)
-    run(one, 0, 20)
-    run(one, 20, 8, 3.0)
-    restore(two, save(one))
-    assert run(one, 28, 30, 3.0) == run(two, 28, 30, 3.0)
-    with pytest.raises(ModelFileError, match="t_last_s: got nothing"):
-        restore(two, {"sets": 1})
-    assert save(two) == save(one)
-
-
 ABSURD = [1e300, -1e18, 2.0**62, 1e10, math.inf, -math.inf, math.nan]
 
 
@@ -84,51 +70,6 @@ def test_a_time_that_no_clock_shows_is_none_and_poisons_nothing(t_s: float, at: 
     assert run(clock, at + 551, 50) == [k * DT_S for k in range(at + 551, at + 601)]
 
 
-def test_a_first_time_that_is_wrong_is_put_right_however_far_it_is_off() -> None:
-    clock = SampleClock(DT_S)
-    first_s = clock.take(0, -8e9, False)
-    seen = run(clock, 1, 50)
-    assert clock.sets == 1
-    np.testing.assert_allclose(np.diff(seen[SET_AFTER - 1 :]), DT_S, atol=3e-6)
-    assert seen[SET_AFTER - 1] == first_s + SET_AFTER * DT_S
-
-
-def test_a_count_that_begins_with_a_sample_without_a_time_is_not_a_clock_that_was_set() -> None:
-    clock = SampleClock(DT_S)
-    run(clock, 0, 10)
-    assert math.isnan(clock.take(1010, math.nan, True))
-    two = SampleClock(DT_S)
-    restore(two, save(clock))
-    for one in (clock, two):
-        assert one.take(1011, 77.0, False) == pytest.approx(1.011)
-        assert one.take(1012, 77.001, False) == pytest.approx(1.012)
-        assert one.sets == 0
-
-
-def test_numbers_are_kept_exactly_and_a_poisoned_state_is_refused() -> None:
-    one, two = SampleClock(DT_S), SampleClock(DT_S)
-    for k in range(40):
-        one.take(2**60 + k, k * DT_S, False)
-    restore(two, save(one))
-    assert two.take(2**60 + 40, 0.04, False) == one.take(2**60 + 40, 0.04, False) == 0.04
-    assert save(two)["number_last"] == 2**60 + 40
-    # A first time of 1e300 would never go away again.
-    for name in ("t_last_s", "t_offset_s"):
-        for time_s in (1e300, math.nan):
-            with pytest.raises(ModelFileError, match=name):
-                restore(two, {**save(one), name: time_s})
-
-
-def test_a_learner_that_refuses_what_is_in_order_forgets_its_own_count() -> None:
-    clock = SampleClock(DT_S)
-    verdicts = ["timing", "out_of_order", "not_finite", "duplicate"] * RESYNC_AFTER
-    heard = verdicts[: [clock.must_resync(verdict) for verdict in verdicts].index(True) + 1]
-    assert len(heard) - heard.count("not_finite") == RESYNC_AFTER
-    for _ in range(3):
-        assert not any([clock.must_resync("timing") for _ in range(RESYNC_AFTER - 1)])
-        assert not clock.must_resync("learnt")
-
-
 @pytest.mark.parametrize("t_s", [*ABSURD, -7.0, 1e6])
 @pytest.mark.parametrize("at", [0, 700])
 def test_an_axis_learns_on_at_once_after_a_single_absurd_time(
@@ -143,26 +84,6 @@ def test_an_axis_learns_on_at_once_after_a_single_absurd_time(
     wrong = SET_AFTER if verdicts[at] == "settling" else 0
     assert not {"timing", "not_finite"} & set(verdicts[at + 1 + wrong :])
     assert verdicts[-500:].count("learnt") > 200
-
-
-def test_what_learns_takes_up_its_count_and_time_from_a_good_sample_alone(models: dict[str, InverseModel]) -> None:
-    """A sample that is late, or has a wrong time, was taken as the first one, and all that followed refused for it."""
-    for late in (False, True):
-        axis = make_axis(models)
-        axis.handle(recording(1000))
-        batch = recording(1000, first=1000)
-        axis.handle(SampleBatch(batch.seq, batch.t_s - 500.0, batch.u_V, batch.y_um))
-        assert isinstance(axis.learner, Learner)
-        axis.learner.resync()
-        batch = recording(1001, first=1999)
-        t_s = batch.t_s - 500.0
-        if not late:
-            batch, t_s = SampleBatch(*(c[1:] for c in (batch.seq, batch.t_s, batch.u_V, batch.y_um))), t_s[1:]
-            t_s[0] = 123.0
-        verdicts = axis.handle(SampleBatch(batch.seq, t_s, batch.u_V, batch.y_um))
-        assert verdicts[0] == ("duplicate" if late else "timing")
-        assert not {"timing", "out_of_order"} & set(verdicts[1:])
-        assert verdicts.count("learnt") > 300
 
 
 @pytest.mark.parametrize("off_s", [-3600.0, 0.25])

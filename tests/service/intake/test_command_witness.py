@@ -106,17 +106,6 @@ def test_a_noisy_voltage_that_is_read_back_is_believed_in_motion_and_at_rest() -
     assert not follow_slowly(lambda seq: step_V * round(slow_V(seq) / step_V), 8000)
 
 
-def test_a_neighbours_voltage_is_right() -> None:
-    """Sender and service may count the instant of a voltage differently by one sample."""
-    for by in (-1, 1):
-        witness = believed()
-        for seq in range(BELIEVED, BELIEVED + 100):
-            if seq % 5 == 0:
-                ask(witness, seq + 5)
-            assert witness.take(seq, commanded_V(seq + by)) is None
-        assert witness.why == ""
-
-
 def test_who_has_never_agreed_in_motion_is_not_believed() -> None:
     """A query may say anything: a stranger that asks, or a voltage read back by another scale, stops no learning."""
     witness = CommandWitness(SPAN_V)
@@ -126,16 +115,6 @@ def test_who_has_never_agreed_in_motion_is_not_believed() -> None:
         # A stage that holds its place agrees with everybody who asked for that place, and says nothing.
         shown_V = commanded_V(0) if seq < 100 else 1.3 * commanded_V(seq) + 1.0
         assert witness.take(seq, shown_V) is None
-
-
-def test_one_of_two_controllers_that_agrees_is_enough() -> None:
-    witness = believed()
-    for seq in range(BELIEVED, BELIEVED + 100):
-        if seq % 5 == 0:
-            ask(witness, seq + 5)
-            nobody = np.full(10, 9.9)
-            witness.note(Pending(seq, nobody[:5], nobody[:5]), nobody[5:], nobody[5:])
-        assert witness.take(seq, commanded_V(seq)) is None
 
 
 def test_what_nobody_commands_any_more_ends_the_doubt() -> None:

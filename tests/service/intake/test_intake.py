@@ -89,31 +89,6 @@ def test_what_has_come_is_no_newer_before_it_is_handled(models: dict[str, Invers
     assert came_s + 0.01 <= loop.queue.handled_at_s <= before_s, "when the last one came, not when it was handled"
 
 
-def test_what_a_standby_holds_back_is_as_new_as_what_is_learnt(models: dict[str, InverseModel]) -> None:
-    loop = loop_of(make_axis(models))
-    loop.set_gate(lambda batch: None)
-    came_s = offered_twice(loop)
-    loop.start()
-    loop.close()
-    assert loop.queue.handled_at_s is not None
-    assert loop.queue.handled_at_s >= came_s + 0.01
-
-
-def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models)
-
-    def broken(batch: SampleBatch, on_snapshot: Any) -> list[str]:
-        raise RuntimeError("for once")
-
-    axis.handle = broken  # type: ignore[method-assign, assignment]
-    loop = loop_of(axis)
-    came_s = offered_twice(loop)
-    loop.start()
-    loop.close()
-    assert loop.queue.handled_at_s == came_s
-    assert [event["event"] for event in axis.take_events()] == ["internal_error"]
-
-
 # --- Commands of operators: in front of what waits, and what is said of them is true.
 
 
@@ -152,23 +127,6 @@ def test_a_command_does_not_wait_for_the_samples_that_wait(models: dict[str, Inv
     finally:
         loop.close()
     assert max(sizes) <= MOST_TOGETHER
-
-
-def test_work_that_has_begun_is_told_as_it_ends(models: dict[str, InverseModel]) -> None:
-    loop = loop_of(make_axis(models))
-    loop.start()
-    done: list[str] = []
-
-    def slow() -> str:
-        time.sleep(0.3)
-        done.append("slow")
-        return "done"
-
-    try:
-        assert loop.queue.call(slow, 0.05, urgent=True) == "done"
-    finally:
-        loop.close()
-    assert done == ["slow"]
 
 
 def test_work_that_was_given_up_is_never_done(models: dict[str, InverseModel]) -> None:

@@ -119,29 +119,6 @@ def test_a_stage_that_restarts_its_count_has_no_name() -> None:
     assert judged(lambda t_s: restart if 4.0 <= t_s < 4.2 else quiet[2.0 <= t_s < 4.0], 8.0) == []
 
 
-def test_an_axis_tells_a_copy_and_a_late_sample_from_another_senders() -> None:
-    axis = make_axis()
-
-    def refused(batch: SampleBatch) -> tuple[int, int]:
-        before = axis.counts
-        axis.handle(batch)
-        return axis.counts.refused - before.refused, axis.counts.foreign - before.foreign
-
-    first = recording(0, 200)
-    axis.handle(first)
-    assert refused(recording(150, 20)) == (20, 0)
-    other = SampleBatch(first.seq, first.t_s, first.u_V, first.y_um + 0.5)
-    assert refused(SampleBatch(*(column[180:190] for column in columns(other)))) == (10, 10)
-    axis.handle(recording(210, 50))
-    assert refused(recording(200, 10)) == (10, 0), "lost, and late"
-    behind = recording(0, 10)
-    assert refused(SampleBatch(behind.seq + 10**6, behind.t_s, behind.u_V, behind.y_um))[1] > 0
-
-
-def columns(batch: SampleBatch) -> tuple[object, ...]:
-    return batch.seq, batch.t_s, batch.u_V, batch.y_um
-
-
 def test_two_stages_with_the_same_numbers_on_one_key_are_told() -> None:
     axis, losses = make_axis(), SampleLosses()
     told = ""

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dehyst.adaptive.errors import ModelFileError
 from dehyst.adaptive.state import restore, save
-from dehyst.adaptive.types import InverseModel, prefixed
+from dehyst.adaptive.types import InverseModel
 from dehyst.service.intake.sequence import (
     AHEAD,
     IN_ORDER,
@@ -31,12 +30,8 @@ from dehyst.service.protocol.model import fingerprint
 from dehyst.service.protocol.samples import MAX_SEQ, SampleBatch
 from dehyst.service.replay import sequence
 from dehyst.service.server.axis import Axis
-from dehyst.service.storage.checkpoint import decode_checkpoint, encode_checkpoint
 from dehyst.sim.recordings import Recording
-from tests.service.axes import loop_of
 from tests.service.server.test_axis import make_axis, recording
-from tests.service.storage.test_stored_files import make_axis as make_competing
-from tests.service.storage.test_stored_files import meta
 
 DT_S = 1e-3
 Row = tuple[int, float]
@@ -93,17 +88,6 @@ def test_a_real_outage_is_borne_out_by_some_samples_and_its_numbers_are_lost(out
     assert number(tracker) == tracker.last == first + 99
 
 
-def test_lossy_samples_bear_a_claim_out_too_and_doubled_ones_do_not() -> None:
-    tracker = begun()
-    claim = [(k, k * DT_S) for k in range(50_000, 50_500, 5)]
-    doubled = [row for row in claim for _ in range(2)]
-    said = taken(tracker, doubled)
-    assert said.index(IN_ORDER) == 2 * (MOST - 1)
-    assert tracker.last == claim[-1][0]
-    # Each number was received, is late, or was lost.
-    assert tracker.received - tracker.late + tracker.lost == tracker.last + 1
-
-
 @pytest.mark.parametrize("to", [100_000, 2**50, MAX_SEQ - 1000])
 def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to: int) -> None:
     tracker = begun()
@@ -120,77 +104,12 @@ def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to:
     assert number(tracker) == 2098 + 1000 + 599
 
 
-@pytest.mark.parametrize("count", [MOST, 100, 1000])
-def test_a_false_outage_that_was_believed_does_not_hold_for_long(count: int) -> None:
-    tracker = begun()
-    taken(tracker, rows(101_000, count))
-    assert tracker.last == 101_000 + count - 1
-    said = taken(tracker, rows(1000, 2000))
-    assert said.index(RESTARTED) + 1 == {MOST: 200, 100: 4 * 85, 1000: 1501}[count]
-    assert said[-1] == IN_ORDER
-
-
 def test_a_first_number_that_is_absurd_gives_way_to_the_next_ones() -> None:
     tracker = SequenceTracker(DT_S)
     assert tracker.take(MAX_SEQ, 0.0) == IN_ORDER
     said = taken(tracker, rows(7, 100))
     assert said == [LATE] * (MOST - 1) + [RESTARTED] + [IN_ORDER] * (100 - MOST)
     assert number(tracker) == 1000 + 99
-
-
-@pytest.mark.parametrize(
-    ("dt_s", "restart", "jump"), [(1e-4, 200, 16), (2e-3, 200, 16), (1e-2, 50, 5), (0.1, 16, 4), (2.0, 16, 4)]
-)
-def test_slow_samples_are_believed_sooner(dt_s: float, restart: int, jump: int) -> None:
-    tracker = begun(dt_s=dt_s)
-    assert taken(tracker, rows(0, 300, dt_s=dt_s)).index(RESTARTED) == restart - 1
-    tracker, outage = begun(dt_s=dt_s), rows(1100 + round(2.0 / dt_s), 300, dt_s=dt_s)
-    assert taken(tracker, outage).index(IN_ORDER) == jump - 1
-
-
-def test_a_stage_that_counts_anew_is_noticed_over_a_line_that_loses_samples() -> None:
-    tracker = begun(100_000)
-    kept = np.random.default_rng(1).random(1000) > 0.1
-    said = taken(tracker, [row for row, keep in zip(rows(0, 1000), kept, strict=True) if keep])
-    assert said.index(RESTARTED) == RESTART_AFTER - 1
-    assert said[-1] == IN_ORDER
-
-
-def test_it_goes_on_from_its_state_in_the_middle_of_a_claim() -> None:
-    for claim in (
-        rows(100_000, MOST - 1),
-        rows(0, RESTART_AFTER - 1),
-        [(MAX_SEQ - 20 + k, 1.0) for k in range(15)],
-    ):
-        one, two = begun(), SequenceTracker(DT_S)
-        taken(one, claim)
-        restore(two, save(one))
-        follows = rows(claim[-1][0] + 1, 5, claim[-1][1] - claim[-1][0] * DT_S)
-        assert taken(two, follows) == taken(one, follows)
-        assert number(one) == number(two)
-        for name, value in save(one).items():
-            np.testing.assert_array_equal(value, save(two)[name])
-    with pytest.raises(ModelFileError, match="received: got nothing"):
-        restore(one, {"last": 3})
-    assert one.last == two.last
-
-
-#: A count that has just begun.
-BEGUN = {"since": 0, "t_s": math.nan, "run_first": -1, "run_t_s": math.nan}
-
-
-@pytest.mark.parametrize("last", [101_000, 2**62])
-def test_a_state_that_was_locked_up_leads_back(last: int) -> None:
-    """One sample numbered so was taken in order, and all that followed were late."""
-    tracker = begun()
-    state = save(tracker) | BEGUN
-    state |= {"last": last, "lost": last - 1000, "gaps": np.array([[1000, last - 1]])}
-    tracker = SequenceTracker(DT_S)
-    restore(tracker, state)
-    said = taken(tracker, rows(1000, 1000))
-    assert said.index(RESTARTED) == RESTART_AFTER - 1
-    assert said[-1] == IN_ORDER
-    assert last < number(tracker) < 2**63 - 2**61
 
 
 # ---- whatever happens
@@ -390,83 +309,6 @@ def test_a_count_that_really_jumps_is_told_and_learnt_on(models: dict[str, Inver
     axis.handle(recording(1000 - RESTART_AFTER, first=RESTART_AFTER))
     assert (axis.handled_seq, axis.newest.seq) == (999, 980)
     assert [e["event"] for e in axis.take_events()] == ["stage_restarted"]
-
-
-@pytest.mark.parametrize("make", [make_axis, make_competing])
-@pytest.mark.parametrize("what_learns_believed_it", [False, True])
-def test_a_checkpoint_that_was_locked_up_heals(
-    make: Callable[..., Axis], what_learns_believed_it: bool, models: dict[str, InverseModel]
-) -> None:
-    """As an earlier version left it behind: 2^62 taken in order, with its snapshot, and all that followed late."""
-    axis = make(models)
-    axis.handle(recording(2000))
-    state = axis.state_dict()
-    state |= prefixed("sequence.", BEGUN) | {"clock.anew": 0, "clock.unheard": 0}
-    state |= {"sequence.last": MAX_SEQ, "sequence.gaps": np.array([[2000, MAX_SEQ - 1]]), "seq": MAX_SEQ}
-    state |= {"served.seq": MAX_SEQ, "clock.number_other": MAX_SEQ, "clock.t_other_s": 2.0, "clock.others": 1}
-    state |= {"clock.number_last": 1999}
-    if what_learns_believed_it:
-        state |= {"clock.number_last": MAX_SEQ, "clock.t_last_s": 8e9, "clock.others": 0}
-        gates = [name for name in state if name.startswith("learner.") and name.endswith(("gates.seq", "gates.t_s"))]
-        assert len(gates) == 2
-        state |= {name: MAX_SEQ if name.endswith("seq") else MAX_SEQ * DT_S for name in gates}
-    again = make(models)
-    again.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(again), state)))[1])
-    verdicts = again.handle(recording(1000, first=2000))
-    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[RESTART_AFTER + 100 :]) > 600
-    assert (again.handled_seq, again.newest.seq) == (2999, 2980)
-    events = [e["event"] for e in again.take_events() if e["event"] != "champion_changed"]
-    assert events == ["stage_restarted", "learner_resynced"]
-    # It goes on from there as any does, to the last bit.
-    other = make(models)
-    other.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(again), again.state_dict())))[1])
-    more = recording(1000, first=3000)
-    assert again.handle(more) == other.handle(more)
-    assert model_of(again) == model_of(other)
-
-
-def test_an_outage_is_no_event(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models)
-    axis.handle(recording(1000))
-    axis.handle(recording(1000, first=31_000))
-    assert axis.take_events() == []
-    assert (axis.handled_seq, axis.counts.samples["lost"], axis.gates[AHEAD]) == (
-        31_999,
-        30_000,
-        MOST - 1,
-    )
-
-
-def test_a_standby_and_a_replay_make_the_same_of_it(models: dict[str, InverseModel]) -> None:
-    batch = with_rows(recording(3000), 1000, *((2**62 - k, math.nan, 4.0, 45.0) for k in range(7)))
-    batch = with_rows(batch, 2000, *((500_000 + k, 1.0, 4.0, 45.0) for k in range(40)))
-    live, pieces, standby = make_axis(models), make_axis(models), make_axis(models)
-    said = live.handle(batch)
-    told = [verdict for k in range(len(batch)) for verdict in pieces.handle(batch.where(np.arange(len(batch)) == k))]
-    assert told == said
-    first = make_axis(models)
-    first.handle(batch.where(np.arange(len(batch)) < 2010))
-    standby.restore(first.state_dict())
-    assert standby.handle(batch.where(np.arange(len(batch)) >= 2010)) == said[2010:]
-    assert model_of(live) == model_of(pieces) == model_of(standby)
-    assert live.handled_seq == pieces.handled_seq == standby.handled_seq
-
-
-def test_who_watches_does_not_see_numbers_far_ahead(models: dict[str, InverseModel]) -> None:
-    class Watcher:
-        def __init__(self) -> None:
-            self.seen: list[int] = []
-
-        def take(self, batch: SampleBatch) -> None:
-            assert len(batch)
-            self.seen += batch.seq.tolist()
-
-    axis = make_axis(models)
-    watcher = Watcher()
-    loop = loop_of(axis, watcher=watcher)
-    loop.handle(with_rows(recording(100), 50, (2**62, 0.05, 4.0, 45.0)))
-    loop.handle(with_rows(recording(0), 0, (2**62, 0.05, 4.0, 45.0)))
-    assert watcher.seen == list(range(100))
 
 
 def test_a_recording_without_numbers_has_some_for_a_time_that_is_absurd_too() -> None:

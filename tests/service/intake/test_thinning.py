@@ -56,34 +56,6 @@ def test_a_queue_that_is_full_within_the_first_fraction_of_a_second_drops_nothin
     assert rate_hz / learnt < factors[-1] < 1.5 * rate_hz / learnt + 1
 
 
-def test_a_stretch_for_which_there_is_no_room_ends_and_the_next_one_begins_whole() -> None:
-    thinner = Thinner(1e-3, 1000)
-    thinner.factor = 2  # of 200 samples
-    thinner.watch(850, 0.0)
-    assert thinner.split(batch(0, 100))[1] is None
-    thinner.watch(950, 0.1)
-    kept, left = thinner.split(batch(100, 60))
-    assert kept is None
-    assert left is not None
-    thinner.watch(600, 0.2)
-    assert thinner.split(batch(160, 40))[0] is None  # a part of a stretch gives the smoother nothing
-    kept, left = thinner.split(batch(200, 400))
-    assert kept is not None
-    assert left is not None
-    assert kept.seq.tolist() == list(range(400, 600))
-    assert thinner.thinned == 60 + 40 + 200
-
-
-def test_a_burst_that_is_soon_over_is_not_thinned() -> None:
-    thinner = Thinner(1e-3, 1000)
-    assert not thinner.watch(900, 0.0)
-    assert not thinner.watch(900, 0.4)
-    assert not thinner.watch(100, 0.5)
-    assert not thinner.watch(900, 0.6)
-    assert not thinner.watch(800, 1.2)  # it empties
-    assert thinner.factor == 1
-
-
 def test_all_samples_come_again_when_the_stage_is_slower_and_vain_trials_become_rarer() -> None:
     thinner = Thinner(1e-3, 1000)
     assert not thinner.watch(600, 0.0)
@@ -114,21 +86,3 @@ def test_whole_stretches_are_handled_and_every_sample_is_in_one_part() -> None:
     assert sorted([*kept.seq.tolist(), *left.seq.tolist()]) == list(range(500, 3500))
     assert kept.seq.tolist() == [*range(500, 1000), *range(2000, 3000)]
     assert thinner.thinned == len(left) == 1500
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "capacity", "factor", "expected"),
-    [
-        (1000, 20_000, 2, 400),  # the longest
-        (1000, 20_000, 6, 200),  # no more than a second is left out
-        (1000, 20_000, 100, 100),  # nor is a stretch too short for the smoother
-        (20_000, 20_000, 2, 4000),  # it fills no more than a fifth of the queue
-        (20_000, 300, 2, 100),
-    ],
-)
-def test_a_stretch_is_as_long_as_the_age_of_what_is_learnt_and_the_queue_allow(
-    rate_hz: float, capacity: int, factor: int, expected: int
-) -> None:
-    thinner = Thinner(1 / rate_hz, capacity)
-    thinner.factor = factor
-    assert thinner.stretch == expected

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import contextlib
 import json
 import re
@@ -17,11 +16,9 @@ from typing import Any
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.lab.cli import main
 from dehyst.service.cli.commands.status import _check
 from dehyst.service.operating import metrics
 from dehyst.service.operating.metrics import page, serve_page
-from dehyst.service.operating.remote import table
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 
@@ -125,20 +122,6 @@ def test_the_health_check(found: list[dict[str, Any]], code: int) -> None:
     assert _check(found) == code
 
 
-def test_the_health_check_names_what_did_not_fit_at_the_start(capsys: pytest.CaptureFixture[str]) -> None:
-    assert _check([status(warnings=["the limits of 0 to 9 V are narrower", 7])]) == 0
-    warned = "warning: demo/x: the limits of 0 to 9 V are narrower"
-    assert capsys.readouterr().out.splitlines() == ["demo/x: ok", warned]
-    assert table([status(warnings=["the limits of 0 to 9 V are narrower"])]).splitlines()[-1] == warned
-
-
-def test_the_health_check_where_nothing_listens(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    assert main(["status", "--check", "--wait", "0", "--endpoint", f"tcp/127.0.0.1:{port}"]) == 4
-    assert f"no answer at tcp/127.0.0.1:{port}" in capsys.readouterr().out
-
-
 def test_the_dashboard_asks_only_for_metrics_that_there_are() -> None:
     recorder = {"written": 1, "lost": 0, "degraded": False}
     quality = {"recent_rms_error_pct": 1.0, "std_V": 1.0, "share_within_std": 0.7, "gain": 1.0, "fallback": 0.0}
@@ -155,12 +138,3 @@ def test_the_dashboard_asks_only_for_metrics_that_there_are() -> None:
     }
     assert len(asked) > 10
     assert asked <= names
-
-
-def test_the_unit_restarts_and_runs_as_its_own_user() -> None:
-    unit = configparser.ConfigParser(strict=False, interpolation=None)
-    unit.optionxform = str  # type: ignore[assignment, method-assign]
-    unit.read(DEPLOY / "dehyst.service")
-    assert unit["Service"]["Restart"] == "on-failure"
-    assert unit["Service"]["DynamicUser"] == "yes"
-    assert unit["Service"]["ExecStart"].endswith("serve --config /etc/dehyst/serve.toml")

@@ -24,7 +24,6 @@ from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import error_from_json
 from dehyst.service.protocol.model import decode_model
 from dehyst.service.runtime.session import open_client
-from dehyst.service.stage_node.faults import decode_fault
 from tests.service.conftest import ServeProcess
 
 DECODE = {name: make() for name, make in TARGETS.items()}
@@ -81,15 +80,6 @@ def test_a_checkpoint_with_an_impossible_array_is_refused(shape: list[Any]) -> N
     DECODE["checkpoint"](len(text).to_bytes(2, "little") + text.encode())
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [b'{"fault": {}}', b'{"fault": ["nan"]}', b'{"fault": "nan", "duration_s": 1%s}' % (b"0" * 400), b"[" * 100_000],
-)
-def test_a_fault_that_is_none_is_refused(payload: bytes) -> None:
-    with pytest.raises(InputError):
-        decode_fault(payload)
-
-
 def test_deeply_nested_json_is_refused_not_followed() -> None:
     deep = b"[" * 100_000
     assert error_from_json(deep).kind == "unknown"  # type: ignore[attr-defined]
@@ -112,8 +102,8 @@ def test_decoding_bad_payloads_keeps_no_memory() -> None:
         rss: int = process.memory_info().rss
         return rss
 
-    settled = rounds(3)
-    assert rounds(10) - settled < 8 * 2**20
+    settled = rounds(2)
+    assert rounds(3) - settled < 2 * 2**20
 
 
 @pytest.mark.e2e

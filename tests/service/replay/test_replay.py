@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,17 +17,14 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.types import FloatArray, InverseModel
-from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from dehyst.baselines.common import Domain
-from dehyst.baselines.linear import LinearInverse, LinearParameters
-from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
+from dehyst.adaptive.types import InverseModel
+from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.lab.cli import main
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.learner import read_learner_settings
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.samples import SampleBatch
-from dehyst.service.replay import Replayed, covered, replay, sequence, summary, write_gates
+from dehyst.service.replay import Replayed, replay, sequence, summary, write_gates
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
@@ -155,35 +151,6 @@ def test_nothing_is_foretold_from_what_comes_later(model_file: Path, samples: Re
     assert not np.array_equal(one.adaptive_V[~before], two.adaptive_V[~before], equal_nan=True)
 
 
-def test_an_older_model_foretells_worse_after_a_change(
-    model_file: Path, samples: Recording, replayed: Replayed
-) -> None:
-    late = replay(samples, axis_of(model_file), age_s=1.0)
-    after = (late.t_s > 3.0) & (late.t_s < 4.5)
-    assert np.nanmean(np.abs(late.adaptive_V[after])) > 1.5 * np.nanmean(np.abs(replayed.adaptive_V[after]))
-
-
-def test_it_is_faster_than_real_time_with_all_that_a_service_has(
-    model: LssvmInverse, samples: Recording, tmp_path: Path
-) -> None:
-    """At 1 kHz with the competition on; by processor time, which what else the machine does hardly lengthens."""
-    seen = Domain(0.0, 90.0, 2e4)
-    others: dict[str, InverseModel] = {
-        "linear": LinearInverse(LinearParameters(11.0), DT_S, seen, 0.1),
-        "mpi": MpiInverse(MPI, DT_S, seen, 0.01),
-        "bouc_wen": BoucWenInverse(TABLE_2_1, DT_S, seen, 0.01),
-    }
-    path = tmp_path / "all.npz"
-    write_bundle(path, {"lssvm_adaptive": model, **others}, BundleMeta("demo", "x", DT_S, u_min_V=0.0, u_max_V=8.0))
-    axis = axis_of(path)
-    begin_s = time.process_time()
-    replay(samples, axis)
-    took_s = time.process_time() - begin_s
-    learner: Any = axis.learner
-    assert set(learner.standing()["contestants"]) == {"lssvm_adaptive", *others}
-    assert took_s < 0.5 * samples.duration_s, f"{took_s:.2f} s of processor for {samples.duration_s:.2f} s of samples"
-
-
 def test_settings_are_read_from_a_service_or_from_a_file_of_their_own(tmp_path: Path) -> None:
     serve = tmp_path / "serve.toml"
     axis = '[[axis]]\nname = "{}"\nmodel = "x.npz"\nu_min_V = 0.0\nu_max_V = 8.0\nslew_V_per_s = 100.0\n'
@@ -288,16 +255,6 @@ def test_the_command_says_what_it_lacks(
     assert "--learn" in capsys.readouterr().err
     assert main([*base, "--model", str(model_file), "--dt-s", "0.01"]) == 2
     assert "sample time" in capsys.readouterr().err
-
-
-def test_stated_shares_are_counted_where_scored() -> None:
-    nan = float("nan")
-    arrays: dict[str, FloatArray] = {name: np.zeros(4) for name in ("t_s", "u_V", "y_um", "frozen_V", "row_t_s")}
-    fake = Replayed(
-        **arrays, adaptive_V=np.array([0.5, -1.5, 3.0, nan]), std_V=np.ones(4), gain_um_per_V=1.0,
-        row_seq=np.arange(4), gate=np.zeros(4, dtype=np.int16), gates=("learnt",), note_t_s=np.zeros(1), notes={},
-    )  # fmt: skip
-    assert covered(fake) == {"one_std": pytest.approx(1 / 3), "two_std": pytest.approx(2 / 3)}
 
 
 def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

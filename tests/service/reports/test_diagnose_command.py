@@ -19,12 +19,12 @@ from pyarrow import parquet
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.cli import main
 from dehyst.service.reports.diagnosis import write_report
-from dehyst.service.reports.diagnosis_page import Source, best_known_number, length, spaced, with_unit
+from dehyst.service.reports.diagnosis_page import Source, length
 from dehyst.sim.diagnosis.diagnose import Options, diagnose
 from dehyst.sim.diagnosis.result import NamedCause, picture
 from dehyst.sim.effects import CAUSES, Chain, effect, simulate
 from dehyst.sim.fitting.fit_data import FitData
-from dehyst.sim.pictures import MEASURED, WITH, WITHOUT, envelope
+from dehyst.sim.pictures import MEASURED, WITH, WITHOUT
 from dehyst.sim.stage.file import load_stage, save_stage
 from dehyst.sim.stage.stage import Stage
 
@@ -110,37 +110,6 @@ def test_the_page_is_short_whole_and_shows_its_pictures(report: tuple[Path, dict
     assert length(data["nominal"]["heldout_rmse_um"]) in page
 
 
-def test_the_viewers_file_holds_the_curves_the_loop_and_the_page(report: tuple[Path, dict[str, Any], str]) -> None:
-    out, _, _ = report
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(str(out / "diagnosis.rrd"))
-    residual: list[float] = []
-    texts: list[str] = []
-    paths = set()
-    for chunk in reader.stream():
-        batch, where = chunk.to_record_batch(), str(chunk.entity_path).lstrip("/")
-        paths.add(where)
-        for name in batch.schema.names:
-            if where == "residual/nominal" and name == "Scalars:scalars":
-                residual += [v[0] for v in batch.column(name).to_pylist()]
-            if where == "report" and name.endswith(":text"):
-                texts += [v[0] for v in batch.column(name).to_pylist()]
-    cause = "cause/1_mains_hum"
-    assert {"voltage_V", "reading/measured_um", "residual/extended", "loop/curve_2", f"{cause}/curve_0"} <= paths
-    assert {f"{cause}/frame", f"{cause}/labels", "loop/frame"} <= paths
-    # In nm there: 50 nm of hum beside 5 nm of noise.
-    assert len(residual) == 8000
-    assert 20.0 < float(np.sqrt(np.mean(np.square(residual)))) < 80.0
-    assert "mains hum" in texts[0]
-    views = set()
-    for chunk in reader.stream(store=reader.blueprints()[0]):
-        batch = chunk.to_record_batch()
-        for column in (c for c in batch.schema.names if c.endswith("display_name")):
-            views |= {text for row in batch.column(column).to_pylist() if row for text in row}
-    assert {"Voltage, V", "Residual of the extended stage, nm", "1. mains hum", "Report"} <= views
-
-
 def test_the_extended_stage_runs_and_makes_the_same_readings(
     report: tuple[Path, dict[str, Any], str], free_port: int
 ) -> None:
@@ -204,16 +173,14 @@ def test_the_page_of_a_record_without_a_named_cause(tmp_path: Path) -> None:
     data = FitData(DT_S, u_V, simulate(chain, u_V, DT_S, seed=5))
     adequate = diagnose(data, None, Options(nominal="linear"))
     assert adequate.verdict == "adequate"
-    write_report(tmp_path, adequate, Source("healthy", nominal="linear"), rrd=False)
+    write_report(tmp_path, adequate, Source("healthy", nominal="linear"))
     assert "explains this recording down to its noise" in (tmp_path / "report.md").read_text()
-    assert not (tmp_path / "diagnosis.rrd").exists()
     strange = replace(adequate, verdict="unexplained", partial=("creep", "stick_slip"), left=("time: everywhere",))
     write_report(tmp_path, strange, Source("strange", nominal="linear"))
     page = (tmp_path / "report.md").read_text()
     assert "no cause of the catalogue explains" in page
     assert "Tried and not named, because together they explain too little here: creep, stick slip" in page
     assert "time: everywhere" in page
-    assert (tmp_path / "diagnosis.rrd").stat().st_size > 10_000
 
 
 # ---- curves and words, without a diagnosis
@@ -263,31 +230,3 @@ def test_creep_is_a_straight_line_over_the_logarithm_of_time() -> None:
     without = next(c for c in shown.curves if c.role == WITHOUT and "3 V" in c.note)
     slope, _ = np.polyfit(np.log10(without.x), without.y, 1)
     assert slope == pytest.approx(300.0, rel=0.1)
-
-
-def test_a_gain_that_drifts_is_seen_over_time() -> None:
-    data = settings()["sine"]
-    before = data.y_um * 0.01 * data.t_s / data.t_s[-1]
-    shown = picture(NamedCause("gain_drift", (), {}, {}, 0.5, 0.001, before, 0.0 * before), data)
-    curve = next(c for c in shown.curves if c.role == WITHOUT)
-    assert curve.y[-1] - curve.y[0] == pytest.approx(1.0, abs=0.3)
-
-
-def test_a_thinned_line_keeps_its_spikes() -> None:
-    t = np.arange(100_000.0)
-    y = np.zeros(t.size)
-    y[54_321] = 7.0
-    thin_t, thin_y = envelope(t, y)
-    assert thin_t.size <= 6100
-    assert thin_y.max() == 7.0
-
-
-def test_numbers_are_said_with_their_units() -> None:
-    assert (length(0.0123), length(12.3)) == ("12.3 nm", "12.3 µm")
-    assert with_unit("tau_s", 0.015) == "0.015 s"
-    assert with_unit("rate_um_per_s", 2.0) == "2 µm/s"
-    assert with_unit("gain_per_decade", 0.01) == "0.01"
-    assert spaced("gain_drift") == "gain drift"
-    none = np.zeros(3)
-    wide = NamedCause("a", (), {"x": 1.0, "z": 1.0}, {"x": (-9.0, 11.0), "z": (0.9, 1.1)}, 0.1, 0.1, none, none)
-    assert best_known_number(wide) == "z"

@@ -37,17 +37,6 @@ def test_warnings_come_by_default_and_information_on_request() -> None:
     assert stream.getvalue().count("a detail") == 1
 
 
-def test_libraries_stay_quiet_below_warnings() -> None:
-    stream = io.StringIO()
-    set_up_logging("debug", stream)
-    logging.getLogger("numba").info("compiling")
-    logging.getLogger("numba").warning("slow")
-    log.debug("ours")
-    assert "compiling" not in stream.getvalue()
-    assert "slow" in stream.getvalue()
-    assert "ours" in stream.getvalue()
-
-
 def test_the_journal_gets_priorities_and_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (tmp_path / "stderr").open("w+", encoding="utf-8") as stream:
         status = (tmp_path / "stderr").stat()
@@ -61,12 +50,3 @@ def test_the_journal_gets_priorities_and_no_time(tmp_path: Path, monkeypatch: py
         assert stream.read().splitlines() == [
             "<7>dehyst.test: d", "<6>dehyst.test: i", "<4>dehyst.test: w", "<4>second line", "<3>dehyst.test: e",
         ]  # fmt: skip
-
-
-def test_a_stream_that_is_not_the_journal_is_plain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("JOURNAL_STREAM", "1:2")
-    with (tmp_path / "stderr").open("w+", encoding="utf-8") as stream:
-        set_up_logging(stream=stream)
-        log.warning("w")
-        stream.seek(0)
-        assert "<" not in stream.read()

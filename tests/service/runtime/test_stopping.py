@@ -66,19 +66,6 @@ def test_a_block_that_must_not_be_broken_ends_first() -> None:
         interrupt()
 
 
-def test_a_block_that_failed_passes_the_signal_on_too() -> None:
-    stop = StopSignal()
-
-    def work() -> None:
-        with unbroken():
-            interrupt()
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        work()
-    assert stop.reason == "SIGINT"
-
-
 def test_a_child_that_was_being_started_is_not_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     StopSignal(raising=True)
     started: list[Child] = []
@@ -126,13 +113,3 @@ def test_the_handler_takes_no_lock_that_the_interrupted_code_may_hold() -> None:
         stop._on_signal(signal.SIGTERM, None)
     assert stop.wait(60.0) == "SIGTERM"
     assert StopSignal().wait(0.01) == "time is over"
-
-
-def test_what_is_to_happen_then_happens_at_once_if_the_signal_has_come() -> None:
-    stop = StopSignal(raising=True)
-    done: list[str] = []
-    stop.then(lambda: done.append("later"))
-    interrupt()
-    assert done == ["later"]
-    stop.then(lambda: done.append("at once"))
-    assert done == ["later", "at once"]

@@ -21,7 +21,7 @@ from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sequence import RESTART_AFTER
 from dehyst.service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
 from dehyst.service.protocol.samples import SampleBatch
-from dehyst.service.server.axis import Axis, EventLimiter, EventLog
+from dehyst.service.server.axis import Axis, EventLog
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
 from dehyst.service.server.status import axis_fields
@@ -78,19 +78,6 @@ def test_the_same_samples_give_the_same_voltages_to_the_last_bit_however_they_ar
     assert abs(ones[0][0] - ones[-1][0]) > 0.02
 
 
-def test_as_of_answers_as_it_would_have_then(models: dict[str, InverseModel]) -> None:
-    live, later = make_axis(models), make_axis(models)
-    for part in parts(recording(600), 10):
-        live.handle(part)
-        if live.handled_seq == 409:
-            then = ask(live)
-    for part in parts(recording(600), 50):
-        later.handle(part)
-    now = ask(later, as_of=409)
-    np.testing.assert_array_equal(then.u_V, now.u_V)
-    assert (then.snapshot_seq, now.snapshot_seq) == (400, 400)
-
-
 def test_as_of_says_when_it_is_behind_and_when_it_is_gone(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models, snapshots_kept=3)
     for part in parts(recording(111), 1):
@@ -124,17 +111,6 @@ def test_memory_travels_and_a_cut_trajectory_is_the_same_trajectory(models: dict
     np.testing.assert_array_equal(memory, whole.memory)
 
 
-def test_tracked_memory_is_that_of_the_samples(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models, learn="", snapshot_every=50)
-    batch = recording(300)
-    for part in parts(batch, 7):
-        axis.handle(part)
-    model = models["lssvm_adaptive"]
-    zero = np.zeros(251)
-    expected = model.track(batch.y_um[:251], zero, zero, batch.u_V[:251], model.rest_memory(float(batch.y_um[0])))
-    np.testing.assert_array_equal(axis.model("lssvm_adaptive")[2], expected)
-
-
 def test_sequence_numbers_that_go_wrong_are_counted(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models)
     batch = recording(100)
@@ -145,16 +121,6 @@ def test_sequence_numbers_that_go_wrong_are_counted(models: dict[str, InverseMod
     assert axis.handled_seq == 159
     assert axis.newest.seq == 140
     assert axis.gates["learnt"] > 0
-
-
-def test_what_was_lost_and_comes_late_after_all_is_no_restart(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models)
-    axis.handle(recording(1000))
-    axis.handle(recording(500, first=2500))
-    # A process that was stopped passes on at once what it had not passed on.
-    axis.handle(recording(1500, first=1000))
-    assert axis.sequence.counters() == {"received": 3000, "lost": 1500, "late": 1500, "restarts": 0}
-    assert axis.handled_seq == 2999
 
 
 def test_a_stage_that_counts_anew_goes_on_being_learnt(models: dict[str, InverseModel]) -> None:
@@ -178,19 +144,6 @@ def test_a_stage_that_counts_anew_goes_on_being_learnt(models: dict[str, Inverse
     zero = np.zeros(1)
     u = [m.feedforward(zero + 45.0, zero, zero, m.rest_memory(45.0)).u_V[0] for m in (model_before, after)]
     assert abs(u[0] - u[1]) < 0.2  # nothing of what was learnt is lost
-
-
-def test_what_is_told_while_samples_are_handled_belongs_together(models: dict[str, InverseModel]) -> None:
-    """A status that was made half way through a restart had the new count of restarts with the old number."""
-    axis = make_axis(models)
-    axis.handle(recording(5000))
-    before = axis.counts
-    samples = {**axis.sequence.counters(), "left_out": 0}
-    assert (before.seq, before.samples, sum(before.gates.values())) == (4999, samples, 5000)
-    told = []
-    axis.handle(recording(400), lambda: told.append((axis.counts, axis.sequence.restarts)))
-    assert told == [(before, 1)] * len(told) != []
-    assert (axis.counts.seq, axis.counts.samples["restarts"], sum(axis.counts.gates.values())) == (399, 1, 5400)
 
 
 @pytest.mark.parametrize(
@@ -267,15 +220,6 @@ def test_learner_settings_are_checked_by_name(models: dict[str, InverseModel]) -
         make_axis(models, learn="linear")
     with pytest.raises(InputError, match="served"):
         make_axis(models, served="mpi")
-
-
-def test_the_domain_comes_from_the_recording_where_the_configuration_gives_none(
-    models: dict[str, InverseModel],
-) -> None:
-    axis = make_axis(models, limits=Limits(0.0, 10.0, 2000.0))
-    assert (axis.limits.y_min_um, axis.limits.y_max_um) == (-4.5, 94.5)
-    axis = make_axis(models, limits=Limits(0.0, 10.0, 2000.0, y_max_um=50.0))
-    assert (axis.limits.y_min_um, axis.limits.y_max_um) == (-4.5, 50.0)
 
 
 def test_queries_are_answered_while_samples_are_handled(models: dict[str, InverseModel]) -> None:
@@ -355,15 +299,6 @@ def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseMo
 # --- Events of an axis: kept for the publisher, limited, and logged through the standard library.
 
 
-def test_of_a_flood_one_event_is_told() -> None:
-    limiter = EventLimiter(calm=100)
-    told = [k for k in range(1000) if k % 50 == 0 and limiter.allows("a", k)]
-    assert told == [0]
-    assert limiter.allows("b", 1000)
-    assert not limiter.allows("a", 1050)
-    assert limiter.allows("a", 1151)
-
-
 def test_every_event_is_logged_with_the_level_of_its_kind(caplog: pytest.LogCaptureFixture) -> None:
     events = EventLog("demo", "x")
     with caplog.at_level(logging.INFO, "dehyst"):
@@ -381,14 +316,3 @@ def test_every_event_is_logged_with_the_level_of_its_kind(caplog: pytest.LogCapt
         (7, "selected", "alice"), (8, "trouble", None), (9, "learner_failed", None),
     ]  # fmt: skip
     assert events.take() == []
-
-
-def test_a_program_without_logging_stays_quiet() -> None:
-    assert any(isinstance(handler, logging.NullHandler) for handler in logging.getLogger("dehyst").handlers)
-
-
-def test_a_flood_keeps_the_newest() -> None:
-    events = EventLog("", "x")
-    for seq in range(1000):
-        events.note(seq, "numbers_ahead", "")
-    assert [event["seq"] for event in events.take()] == list(range(744, 1000))

@@ -28,7 +28,6 @@ from dehyst.service.background.retuner import Retuner
 from dehyst.service.background.retuning_worker import start_job
 from dehyst.service.background.settings import RetuningConfig
 from dehyst.service.config.settings import AxisConfig
-from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.query import FeedforwardQuery
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
@@ -147,14 +146,6 @@ def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
     assert learner.champion == "lssvm_adaptive"
     assert axis.answering() == "learnt"
     np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
-
-
-def test_alone_the_learner_answers(bundle: Bundle) -> None:
-    axis = axis_of(bundle, compete=())
-    assert axis.served == "lssvm_adaptive"
-    assert "auto" not in axis.newest.models
-    with pytest.raises(InputError):
-        ask(axis, "auto")
 
 
 def test_a_state_goes_on_to_the_last_bit_with_adoptions_to_come(
@@ -311,44 +302,6 @@ def test_a_bad_adoption_is_refused_by_the_learner_and_changes_nothing(
         np.testing.assert_array_equal(value, told.newest.models["lssvm_adaptive"].state_dict()[key])
 
 
-class Told:
-    """Stands in for the background: gives the results it is told, in order."""
-
-    def __init__(self, *results: dict[str, Any]) -> None:
-        self.results = list(results)
-        self.fresh: list[int] = []
-
-    def __call__(self, order: dict[str, Any], arrays: dict[str, Any], timeout_s: float) -> Told:
-        if order["kind"] == "compare":
-            self.fresh.append(arrays["after.targets_V"].size)
-        self.result = self.results.pop(0)
-        return self
-
-    def cancel(self) -> None: ...
-
-
-PROPOSED = {"changed": True, "gamma": 50.0, "widths": [2.0] * 5}
-OPEN = {"better": False, "open": True, "fresh": 0, "before_V": 1.0, "after_V": 0.9, "sigmas": 1.0}
-
-
-@pytest.mark.parametrize("retuner", [{"fresh": 20}], indirect=True)
-@pytest.mark.alone
-def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
-    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told = Told(PROPOSED, OPEN, OPEN, OPEN)
-    monkeypatch.setattr("dehyst.service.background.retuner.start_job", told)
-    axis = tunable(bundle)
-    give(axis, recorded, 6000, 8000, retuner)
-    retuner.request({})
-    give(axis, recorded, 8000, 13000, retuner)
-    first, second, third = told.fresh
-    assert 20 <= first < second < third
-    assert second >= 40
-    assert third >= 80
-    assert retuner.status()["last"]["outcome"] == "worse"
-
-
 @pytest.mark.parametrize("retuner", [{"timeout_s": 0.05}], indirect=True)
 @pytest.mark.alone
 def test_what_takes_too_long_is_ended_and_counted(
@@ -377,30 +330,6 @@ def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     assert retuner.status()["started"] == 0
     give(axis, (np.concatenate([rest[0], u_V]), np.concatenate([rest[1], y_um])), 3000, 6000, retuner)
     assert retuner.status()["started"] == 1
-
-
-@pytest.mark.alone
-def test_a_frozen_learner_is_left_alone(
-    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
-) -> None:
-    axis = axis_of(bundle, compete=())
-    give(axis, recorded, 0, 1000, retuner)
-    axis.freeze("test")
-    retuner.request({})
-    give(axis, recorded, 1000, 2000, retuner)
-    assert retuner.status()["started"] == 0
-    with pytest.raises(FieldError):
-        retuner.request({"hurry": True})
-
-
-@pytest.mark.alone
-def test_a_worker_that_dies_says_why() -> None:
-    job = start_job({"kind": "nonsense"}, {}, 60.0)
-    until = time.monotonic() + 60.0
-    while job.result is None and time.monotonic() < until:
-        time.sleep(0.02)
-    assert job.result is not None
-    assert "without a result" in job.result["error"]
 
 
 def test_adoptions_are_made_once_in_order_at_their_sample(bundle: Bundle, tmp_path: Path) -> None:

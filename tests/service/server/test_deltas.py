@@ -143,18 +143,3 @@ def test_what_is_learnt_and_answered_does_not_depend_on_who_follows(models: dict
     assert mine.keys() == others.keys()
     for name, value in mine.items():
         np.testing.assert_array_equal(value, others[name], err_msg=name)
-
-
-def test_long_messages_move_at_the_same_samples(models: dict[str, InverseModel]) -> None:
-    """A message that the stage sends late holds more samples; what a controller plans by numbers stays the same."""
-    seen = []
-    for size in (5, 10, 40):
-        axis = make_axis(models, ())
-        axis.moves.want(True)
-        numbers = []
-        for batch in batches(1200, size):
-            axis.handle(batch)
-            numbers += [move.seq for move in axis.moves.drain()]
-        seen.append(numbers)
-    assert seen[0] == seen[1] == seen[2]
-    assert len(seen[0]) > 200

@@ -18,7 +18,7 @@ from dehyst.service.intake.sample_queue import Arrived
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
-from dehyst.service.server.health import Health, Staleness
+from dehyst.service.server.health import Health
 from dehyst.service.server.status import axis_fields
 from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.service.axes import loop_of
@@ -136,24 +136,6 @@ def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.
     return health
 
 
-def test_the_status_says_why_there_is_a_trouble_until_it_is_over(axis_loop: Make) -> None:
-    loop = axis_loop(META)
-    axis = loop.axis
-    axis.note("trouble", "samples_lost (95 of 100 numbers are missing)")
-    axis.note("trouble", "out_of_envelope (gain 1.6 of the identified): widen learner.envelope.gain")
-
-    def said(losses: str) -> dict[str, Any]:
-        return axis_fields(loop, losses=losses)
-
-    assert said("samples_lost")["trouble_why"] == "samples_lost (95 of 100 numbers are missing)"
-    state, reason = Health().state(said("out_of_envelope"))
-    assert state == "out_of_envelope"
-    assert "widen learner.envelope.gain" in reason
-    axis.note("recovered", "out_of_envelope")
-    assert said("out_of_envelope")["trouble_why"] == ""
-    assert said("")["trouble_why"] == ""
-
-
 def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     loop = axis_loop(META)
     assert Health().state(axis_fields(loop)) == ("no samples", "none has come since the start")
@@ -180,28 +162,3 @@ def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     assert good.state({**base, "trouble": "rail"})[0] == "rail"
     assert good.state({**base, "learning": None})[0] == "not learning"
     assert good.state({**base, "quality": {"valid": 0.0}})[0] == "unsure"
-
-
-def test_a_learner_that_is_just_behind_is_stale_once() -> None:
-    staleness = Staleness(2.0)
-    ages_s = [0.5, 1.9, *[2.1, 1.7] * 20, 1.2]
-    assert [age for age in ages_s if staleness.look(age)] == [2.1]
-    assert staleness.stale
-    assert staleness.look(0.9)
-    assert not staleness.stale
-    never = Staleness(0.0)
-    assert not any(never.look(age) for age in (0.0, 5.0, 1e9))
-
-
-def test_ok_comes_back_when_the_drops_are_over(axis_loop: Make) -> None:
-    loop = axis_loop(META)
-    loop.offer(batches(0, 25)[0])
-    loop.start()
-    loop.close()
-    health, base = Health(), axis_fields(loop)
-    states = []
-    for k in range(30):
-        health.update(float(k), 1000 * k, 50 if k >= 5 else 0, {"learnt": 1000 * k})
-        states.append(health.state(base)[0])
-    assert states[6] == "dropping"
-    assert states[-1] == "ok"

@@ -73,16 +73,6 @@ def test_a_receiver_that_does_not_read_keeps_nobody_waiting(asked: Asked) -> Non
     stuck.set()
 
 
-def test_a_slice_waits_while_a_short_query_is_answered(asked: Asked) -> None:
-    asked.may_go.set()
-    # It waits no longer than 2 ms a slice, so that a flood of short ones does not stop it.
-    asked.queries.short_begins()
-    asked.ask("a", 5 * SLICE)
-    asked.wait(1)
-    asked.queries.short_ends()
-    assert asked.answered == ["a"]
-
-
 def busy(asked: Asked, name: str, points: int) -> float:
     with pytest.raises(BusyError) as refused:
         asked.ask(name, points)
@@ -105,13 +95,6 @@ def test_a_query_that_would_take_too_long_beside_others_is_refused_and_has_the_n
     queries._sources["c"].jobs[0].points = 0
     assert busy(asked, "d", 65_536) > 0.0
     asked.ask("b", 65_536)
-
-
-def test_no_more_is_held_than_memory_is_meant_for(asked: Asked) -> None:
-    for i in range(16):
-        asked.ask(f"s{i}", 65_000)
-    assert busy(asked, "late", 200) > 0.0
-    assert busy(asked, "s3", 65_000) > 0.0
 
 
 def test_the_end_answers_everybody(asked: Asked) -> None:

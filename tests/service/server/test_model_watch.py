@@ -14,11 +14,10 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.gates import DUPLICATE, GAP, LEARNT, OUT_OF_ORDER, UNTRUSTED
+from dehyst.adaptive.online.gates import DUPLICATE, OUT_OF_ORDER
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from dehyst.service.answers.guard import Limits
-from dehyst.service.answers.which_model import NOTHING_LEARNT
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sequence import AHEAD
 from dehyst.service.protocol.model import fingerprint
@@ -26,7 +25,7 @@ from dehyst.service.protocol.query import STAND_IN, FeedforwardQuery
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis, make_learner
-from dehyst.service.server.learner_supervisor import UNUSABLE, SampleWatch
+from dehyst.service.server.learner_supervisor import UNUSABLE
 from dehyst.service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import SmoothingLearner
 from tests.service.conftest import DT_S, make_models
@@ -116,25 +115,6 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     assert bench.u_V == pytest.approx(before, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("swing", "learns", "verdict", "at_s"),
-    [(0.5, False, UNTRUSTED, 0.5), (0.5, True, UNTRUSTED, None), (0.005, False, UNTRUSTED, None),
-     (0.5, False, GAP, None)],
-)  # fmt: skip
-def test_half_a_second_of_motion_without_an_accepted_sample_is_a_trouble(
-    swing: float, learns: bool, verdict: str, at_s: float | None
-) -> None:
-    """And neither is rest, nor a motion of which a sample is learnt now and then, nor the time after missing ones."""
-    watch = SampleWatch(DT_S, 10.0)
-    found: list[float] = []
-    for k in range(1000):
-        u_V = 5.0 + 10.0 * swing * math.sin(2.0 * math.pi * 3.0 * k * DT_S)
-        watch.take(u_V, 50.0 + u_V, LEARNT if learns and k % 400 == 0 else verdict)
-        if (k + 1) % 20 == 0:
-            found += [(k + 1) * DT_S] * (watch.trouble("") == NOTHING_LEARNT)
-    assert (found[0] if found else None) == pytest.approx(at_s)
-
-
 @pytest.mark.parametrize("lie", [frozen, poisoned, lambda k, y: np.minimum(y, 50.0), lambda k, y: y * math.nan])
 def test_going_back_forgets_what_was_learnt_and_not_where_the_stage_has_been(lie: Any) -> None:
     """Else the learner would go on with turning points of seconds ago, and every caller with other ones."""
@@ -184,15 +164,6 @@ def test_while_the_learner_distrusts_the_sensor_what_it_serves_is_served_alone_a
     bench.run(2000)
     assert bench.axis.newest.trouble == ""
     assert not bench.axis.learner.distrusts
-
-
-def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
-    bench = Bench(make_axis())
-    bench.run(1000)
-    k = np.arange(1000, 4000)
-    bench.axis.handle(SampleBatch(k, k * DT_S, np.full(3000, 4.0), np.full(3000, 43.0)))
-    assert bench.axis.newest.trouble == ""
-    assert bench.events == []
 
 
 class Sick(SmoothingLearner):
@@ -255,22 +226,6 @@ def test_a_learner_that_failed_is_begun_anew_from_the_last_good_model(compete: t
     assert abs(bench.u_V - before) < 0.1
 
 
-def test_a_standby_that_begins_in_the_middle_of_it_decides_alike() -> None:
-    one, other = Bench(make_axis()), Bench(make_axis())
-    one.run(2200)
-    one.run(300, frozen)
-    other.axis.restore(one.axis.state_dict())
-    other.k = one.k
-    for lie in (frozen, lambda k, y: y):
-        for _ in range(30):
-            for bench in (one, other):
-                bench.run(60, lie)
-            a, b = one.axis.newest, other.axis.newest
-            assert (a.seq, a.trouble, a.trust) == (b.seq, b.trouble, b.trust)
-            assert fingerprint(a.models[NAME]) == fingerprint(b.models[NAME])
-    assert one.axis.newest.trouble == ""
-
-
 @pytest.mark.parametrize("at", [2000, 2340, 2999])
 def test_a_standby_goes_back_to_the_same_state(at: int) -> None:
     """Whenever it took the state over: else it would differ after each lie, and take the state over once more."""
@@ -328,3 +283,12 @@ def test_what_is_refused_teaches_and_moves_nothing(seq: int, t_s: float, u_V: fl
 
 def _is_float(value: Any) -> bool:
     return bool(np.asarray(value).dtype.kind == "f")
+
+
+def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
+    bench = Bench(make_axis())
+    bench.run(1000)
+    k = np.arange(1000, 4000)
+    bench.axis.handle(SampleBatch(k, k * DT_S, np.full(3000, 4.0), np.full(3000, 43.0)))
+    assert bench.axis.newest.trouble == ""
+    assert bench.events == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from benchmarks.forged_states import make_axis, recording
@@ -12,13 +11,6 @@ from dehyst.service.server.state_page import page
 def test_the_page_is_up_to_date() -> None:
     committed = (Path(__file__).resolve().parents[3] / "docs" / "state.md").read_text(encoding="utf-8")
     assert committed == page(), "run: python -m dehyst.service.server.state_page > docs/state.md"
-
-
-def test_the_entries_of_a_record_are_listed_once() -> None:
-    """A control trial is a trial of the sensor again."""
-    names = re.findall(r"^\| `([^`]+)`", page(), re.M)
-    assert [name for name in names if name.startswith("learner.front.control.")] == ["learner.front.control."]
-    assert "entries as in `learner.front.trial.`" in page()
 
 
 def test_every_entry_of_an_axis_that_learns_is_on_the_page() -> None:

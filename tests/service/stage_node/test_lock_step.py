@@ -15,33 +15,10 @@ from dehyst.lab.testbed.identified_stage import Rig
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import SURELY, open_client, wait_followed
-from dehyst.service.stage_node.exchange import CommandBuffer
 from dehyst.service.stage_node.node import NodeConfig
 from dehyst.sim.stage.presets import preset
 
 PAUSE_S = 0.4
-
-
-def waited(buffer: CommandBuffer, k: int, longest_s: float) -> float:
-    begin = time.perf_counter()
-    while buffer.lacks(k, begin + longest_s):
-        pass
-    return time.perf_counter() - begin
-
-
-def test_a_tick_waits_for_its_voltage_up_to_the_limit_and_once() -> None:
-    buffer = CommandBuffer()
-    assert waited(buffer, 0, 1.0) < 0.1, "before the first command nobody controls"
-    buffer.put(wire.Block(0, np.ones(2)))
-    assert waited(buffer, 0, 1.0) < 0.1
-    later = threading.Timer(0.1, buffer.put, [wire.Block(2, np.ones(1))])
-    later.start()
-    assert 0.05 < waited(buffer, 2, 10.0) < 5.0
-    later.join()
-    assert 0.15 < waited(buffer, 3, 0.2) < 1.0
-    assert waited(buffer, 4, 1.0) < 0.1, "whoever sends no more stops the clock once"
-    buffer.put(wire.Block(9, np.ones(1)))
-    assert 0.15 < waited(buffer, 5, 0.2) < 1.0
 
 
 @pytest.mark.parametrize("wait_s", [math.nan, 61.0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dehyst.adaptive.errors import InputError
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import SURELY, open_client
-from dehyst.service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
+from dehyst.service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, SampleRing, Sender
 from dehyst.service.stage_node.faults import fault_key
 from dehyst.service.stage_node.node import status_key
 from dehyst.sim.stage.presets import preset
@@ -228,51 +226,6 @@ def test_bad_options_get_a_message_and_status_2(
 
     assert main(["stage", *options]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_a_port_in_use_is_said() -> None:
-    with socket.socket() as holder:
-        holder.bind(("127.0.0.1", 0))
-        holder.listen()
-        endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
-        command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
-    assert "in use" in done.stderr
-
-
-def test_command_buffer_takes_by_number_and_holds_what_is_missing() -> None:
-    buffer = CommandBuffer(size=16)
-    assert buffer.take(0) == 0.0
-    assert buffer.counts["missing"] == 0, "before the first command nothing is missing"
-    buffer.put(wire.Block(3, np.array([3.0, 4.0])))
-    buffer.put(wire.Block(1, np.array([1.0])))
-    assert [buffer.take(k) for k in range(1, 7)] == [1.0, 1.0, 3.0, 4.0, 4.0, 4.0]
-    assert buffer.counts["missing"] == 3
-    buffer.put(wire.Block(5, np.array([5.0, 6.0, 7.0, 8.0])))
-    assert buffer.counts["late"] == 2
-    assert buffer.take(7) == 7.0
-    # A later block for the same number replaces the earlier one; the ring's old entries never come back.
-    buffer.put(wire.Block(8, np.array([80.0])))
-    assert [buffer.take(k) for k in range(8, 40)] == [80.0] * 32
-    with pytest.raises(InputError, match=r"seq: got 56, expected at most 55"):
-        buffer.put(wire.Block(40, np.zeros(17)))
-
-
-def test_stage_file_and_options_make_the_configuration(tmp_path: Path) -> None:
-    import argparse
-
-    from dehyst.service.cli.commands.stage import add_arguments, stage_config
-    from dehyst.sim.stage.file import save_stage
-
-    path = tmp_path / "stage.toml"
-    save_stage(preset("bouc_wen", seed=3), path)
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    config = stage_config(parser.parse_args(["--file", str(path), "--rate", "2000"]))
-    assert (config.name, config.seed, config.dt_s) == ("bouc_wen", 3, 0.0005)
-    changed = stage_config(parser.parse_args(["--seed", "9", "--change", "1:gain_drift.gain=-0.06"]))
-    assert changed == preset("rich", seed=9, changes=((1.0, {"gain_drift.gain": -0.06}),))
 
 
 def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -> None:

@@ -12,7 +12,7 @@ import pytest
 from dehyst.service.cli.main import main
 from dehyst.service.client.client import Client
 from dehyst.service.operating.metrics import page
-from dehyst.service.server.health import NOT_KEPT, NOT_RECORDED, DiskFailures, Health
+from dehyst.service.server.health import NOT_KEPT, NOT_RECORDED, DiskFailures
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually
 
@@ -41,13 +41,6 @@ def test_what_fails_has_a_name_until_it_is_over() -> None:
     assert "too slow" in watch.why
     assert watch.look(counters(lost=7, dropped=3), kept)
     assert not watch.look(None, None)
-
-
-def test_the_state_says_how_much_is_lost() -> None:
-    status = {"trouble": NOT_RECORDED, "trouble_why": "samples_not_recorded (full)", "recorder": counters(lost=40)}
-    state, reason = Health().state(status)
-    assert state == NOT_RECORDED
-    assert "(full); 40 samples since the start are in no recording" in reason
 
 
 @pytest.mark.e2e

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.forged_states import DT_S, Victims, make_axis, recording
+from benchmarks.forged_states import DT_S, make_axis, recording
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
-COUNT = 400
+COUNT = 120
 
 
 def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
@@ -79,11 +79,11 @@ def test_the_refusal_names_the_entry_what_it_is_and_what_is_expected() -> None:
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_no_state_of_an_axis_with_faulty_samples_is_refused(alone: bool) -> None:
-    """Half a minute of stuck, jumping, wild, missing and lost readings; a state is taken every 0.2 s or so."""
+    """A quarter of a minute of stuck, jumping, wild, missing and lost readings; a state is taken every 0.2 s or so."""
     rng = np.random.default_rng(3)
     axis, other = make_axis(alone), make_axis(alone)
     first = 0
-    for _ in range(60):
+    for _ in range(30):
         fault = str(rng.choice(["", "", "stuck", "jumped", "nan", "wild", "lost"]))
         for _ in range(int(rng.integers(1, 12))):
             batch = recording(first, 17, fault)
@@ -96,13 +96,6 @@ def test_no_state_of_an_axis_with_faulty_samples_is_refused(alone: bool) -> None
                 axis.handle(batch)
         other.restore(through_a_file(axis.state_dict()))
         assert other.handled_seq == axis.handled_seq
-
-
-def test_the_states_that_are_forged_are_taken_as_they_are() -> None:
-    victims = Victims()
-    for alone, state in victims.states.values():
-        assert victims.take(alone, state, over_wire=False) == "taken"
-        assert victims.take(alone, state, over_wire=True) == "taken"
 
 
 @pytest.mark.parametrize(

@@ -7,15 +7,13 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dehyst.service.client.client import Client
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.storage.owner import FolderOwnedError, FolderOwner, owner_of
-from dehyst.service.storage.recorder import Recorder, RecorderConfig
-from dehyst.service.storage.segments import LOCK, rows_behind, segments
-from tests.service.conftest import DT_S, unused_port, write_config
+from dehyst.service.storage.segments import LOCK
+from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually
 
 HOLDS = """
@@ -49,25 +47,6 @@ def test_the_lock_ends_with_its_process_and_the_name_stays(tmp_path: Path) -> No
     mine.hold("recorder", 1.0)
     mine.take()  # what is held is held
     mine.release()
-
-
-def test_a_journal_of_another_axis_is_not_read(tmp_path: Path) -> None:
-    k = np.arange(300)
-    with Recorder(RecorderConfig(tmp_path, "demo/x"), hold_s=0.0) as recorder:
-        recorder.put(k, k * DT_S, k * 0.1, k * 0.2, "learnt")
-        eventually(lambda: recorder.counters()["written"] == 300)
-        own = rows_behind(tmp_path, 100, "demo/x")
-        assert own is not None
-        assert len(own) == 200
-        assert rows_behind(tmp_path, 100, "demo/y") is None
-    with pytest.raises(FieldError, match="which holds files of demo/x"):
-        Recorder(RecorderConfig(tmp_path, "demo/y"), hold_s=0.0)
-    # Without a name it records nothing into another's folder either.
-    with Recorder(RecorderConfig(tmp_path, "demo/y")) as recorder:
-        recorder.put(k, k * DT_S, k * 0.1, k * 0.2, "learnt")
-        eventually(lambda: recorder.counters()["lost"] == 300)
-        assert "files of demo/x" in recorder.counters()["error"]
-    assert len(segments(tmp_path)) == 1
 
 
 @pytest.mark.e2e

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dehyst.adaptive.errors import InputError
 from dehyst.service.storage import segments as recorder_files
 from dehyst.service.storage.recorder import ASIDE, Recorder, RecorderConfig
 from dehyst.service.storage.segments import Journal, Rows, read_journal, segments
@@ -89,43 +88,6 @@ def test_what_was_put_is_in_the_file_at_once_however_long_the_disk_takes(
     print(f"in the file after {1e3 * np.median(took_s):.2f} ms, at most {1e3 * max(took_s):.1f} ms")
     assert np.median(took_s) < 0.01
     assert len(read(tmp_path)) == 500
-
-
-def test_a_disk_that_cannot_sync_is_one_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ill = threading.Event()
-    ill.set()
-
-    def fsync(_: int) -> None:
-        if ill.is_set():
-            raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    with Recorder(config(tmp_path, sync_s=0.01)) as recorder:
-        k = 0
-
-        def fed_until(degraded: bool) -> bool:
-            nonlocal k
-            recorder.put(*block(k, 10), reason="learnt")
-            k += 10
-            return bool(recorder.counters()["degraded"]) == degraded
-
-        wait_for(lambda: fed_until(True))
-        assert "Input/output error" in recorder.counters()["error"]
-        ill.clear()
-        wait_for(lambda: fed_until(False))
-    counters = recorder.counters()
-    assert counters["offered"] == counters["written"] + counters["lost"] == k
-    assert len(read(tmp_path)) == counters["written"]
-
-
-def test_refused_samples_are_kept_as_they_came(tmp_path: Path) -> None:
-    with Recorder(config(tmp_path)) as recorder:
-        recorder.put(*block(0, 300), reason="learnt")
-        recorder.put(300, 0.3, 1.0, float("nan"), "not_finite")
-    recording = read(tmp_path)
-    assert recording.reason is not None
-    assert np.isnan(recording.y_um[-1])
-    assert recording.reason[-1] == "not_finite"
 
 
 def test_the_oldest_segments_go_when_the_disks_share_is_used_up_journals_included(tmp_path: Path) -> None:
@@ -224,28 +186,6 @@ def test_a_full_disk_degrades_the_recording_and_nothing_else(
     assert len(recording) == counters["written"]
 
 
-def test_a_directory_that_cannot_be_made_is_no_reason_to_fall(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with Recorder(config(tmp_path / "file" / "here")) as recorder:
-        recorder.put(*block(0, 10), reason="learnt")
-        wait_for(lambda: recorder.counters()["lost"] == 10)
-        assert recorder.counters()["degraded"]
-
-
-def test_two_recorders_do_not_share_a_directory(tmp_path: Path) -> None:
-    with Recorder(config(tmp_path)) as first:
-        first.put(*block(0, 300), reason="learnt")
-        wait_for(lambda: first.counters()["written"] == 300)
-        with Recorder(config(tmp_path)) as second:
-            second.put(*block(0, 10), reason="learnt")
-            wait_for(lambda: second.counters()["lost"] == 10)
-            assert f"{tmp_path}, held by process {os.getpid()}" in second.counters()["error"]
-        # One that had nothing to write leaves the open journal to its owner.
-        Recorder(config(tmp_path)).close()
-        assert segments(tmp_path) == []
-    assert len(read(tmp_path)) == 300
-
-
 @pytest.mark.parametrize("more", [0, 1], ids=["no sample comes", "a sample comes"])
 def test_a_killed_process_leaves_a_stream_that_the_next_run_closes(tmp_path: Path, more: int) -> None:
     program = (
@@ -316,55 +256,6 @@ def test_a_restart_finds_what_came_behind_its_checkpoint_across_segments(tmp_pat
         again = recorder_files.rows_behind(tmp_path, 1100, "")
     assert again is not None
     assert again.seq.tolist()[-1] == 5049
-
-
-def test_a_file_size_limit_is_a_full_disk(tmp_path: Path) -> None:
-    """A real one, from the operating system, in the middle of a row."""
-    program = (
-        "import resource, sys, time, numpy as np\n"
-        "from pathlib import Path\n"
-        "from dehyst.service.storage.recorder import Recorder, RecorderConfig\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_001, resource.RLIM_INFINITY))\n"
-        "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.005, retry_s=0.05))\n"
-        "k = 0\n"
-        "def feed(until):\n"
-        "    global k\n"
-        "    end = time.monotonic() + 20.0\n"
-        "    while not until(r.counters()) and time.monotonic() < end:\n"
-        "        r.put(np.arange(k, k + 10), 1e-3 * np.arange(k, k + 10), np.ones(10), np.ones(10), 'learnt')\n"
-        "        k += 10\n"
-        "        time.sleep(0.0005)\n"
-        "feed(lambda c: c['lost'] and c['degraded'])\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))\n"
-        "feed(lambda c: not c['degraded'])\n"
-        "r.close()\n"
-        "c = r.counters()\n"
-        "assert c['offered'] == k == c['written'] + c['lost'], c\n"
-        "print(c['written'], c['errors'])\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    written, errors = map(int, done.stdout.split())
-    assert errors >= 1
-    recording = read(tmp_path)
-    assert recording.seq is not None
-    assert len(recording) == written
-    assert recording.seq[0] == 0
-    assert np.all(np.diff(recording.seq) >= 1)
-
-
-def test_bad_configuration_and_bad_rows(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="segment_rows: got 0"):
-        config(tmp_path, segment_rows=0)
-    with Recorder(config(tmp_path)) as recorder, pytest.raises(InputError, match="y_um: got 1 values, expected 2"):
-        recorder.put([1, 2], [0.0, 0.1], [1.0, 2.0], [1.0], "learnt")
 
 
 def test_what_was_dropped_before_it_was_handled_is_recorded_apart(tmp_path: Path) -> None:

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import main
-from dehyst.service.cli.commands.view import twins
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import open_service
 from dehyst.service.security.authenticator import own_authenticator
 from dehyst.service.viewer.consumer import Consumer, ConsumerConfig
-from dehyst.service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking, event_record
+from dehyst.service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking
 from tests.service.conftest import unused_port
 from tests.service.viewer.test_sink import read_back
 
@@ -152,20 +150,6 @@ def test_a_change_that_is_announced_comes_before_its_samples() -> None:
     assert max((t.t_s[-1] for t in before if isinstance(t, Tracking)), default=0.0) < 0.3
 
 
-def test_an_output_that_takes_nothing_costs_nothing_but_its_batches() -> None:
-    full, basket = Basket(full=True), Basket()
-    with open_service([f"tcp/127.0.0.1:{unused_port()}"]) as session:
-        feed = Feed(session, "demo", {"x": 0.05})
-        consumer = Consumer(session, ConsumerConfig("demo", "x", batch_s=0.05), [full, basket])
-        for _ in range(10):
-            feed.send(BATCH)
-            time.sleep(0.02)
-        consumer.close()
-    assert sum(len(t.seq) for t in basket.of(Tracking)) == 10 * BATCH
-    assert full.dropped > 0
-    assert basket.of(Health)[-1].counts["dropped_batches"] > 0
-
-
 def test_a_full_inbox_drops_and_counts() -> None:
     basket = Basket()
     with open_service([f"tcp/127.0.0.1:{unused_port()}"]) as session:
@@ -238,18 +222,3 @@ def test_what_cannot_be_done_is_said_and_ends_with_a_status(
     assert main(["view", *options]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_events_of_any_form_become_a_line() -> None:
-    assert event_record(1.0, 2, {"event": "change", "detail": "gain"}) == Event(1.0, 2, "change: gain", "WARN", True)
-    assert event_record(1.0, 2, {"event": "ready"}).text == "ready"
-    assert event_record(1.0, 2, {"event": "learner_failed", "detail": "x"}).level == "ERROR"
-    assert event_record(1.0, 2, {}).text == ""
-
-
-def test_twins_are_pairs_and_differ() -> None:
-    assert twins(["x_linear=linear", "x_mpi=mpi"]) == (("x_linear", "linear"), ("x_mpi", "mpi"))
-    with pytest.raises(InputError, match="twins"):
-        ConsumerConfig("demo", "x", twins=(("x", "linear"),))
-    with pytest.raises(InputError, match="twins"):
-        ConsumerConfig("demo", "x", twins=(("x_a", "linear"), ("x_b", "linear")))

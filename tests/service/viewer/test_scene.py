@@ -17,8 +17,8 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
 from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
-from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane, grown, ticks
-from dehyst.service.viewer.records import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
+from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
+from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
 from dehyst.service.viewer.rerun_sink import cut, in_order
 from dehyst.service.viewer.scene import Scene
 
@@ -116,74 +116,7 @@ def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: lis
     assert join.take(everything=True) is None
 
 
-def test_a_twin_without_a_reference_takes_that_of_the_main_unit() -> None:
-    main, own = ReferenceRing(), ReferenceRing()
-    main.put(np.arange(4), np.array([1.0, 2.0, 3.0, 4.0]))
-    own.put(np.array([2]), np.array([30.0]))
-    join = SampleReferenceJoin("linear", own, fallback=main)
-    k = np.arange(4)
-    join.put(k, k * 1e-3, k * 0.0, k * 0.0)
-    got = join.take()
-    assert got is not None
-    assert got.reference_um.tolist() == [1.0, 2.0, 30.0, 4.0]
-
-
-def test_a_ring_never_gives_away_what_it_has_overwritten() -> None:
-    ring = ReferenceRing(size=8)
-    ring.put(np.arange(20), np.arange(20.0))
-    assert np.isnan(ring.get(np.arange(12))).all()
-    assert ring.get(np.arange(12, 20)).tolist() == list(range(12, 20))
-    assert np.isnan(ring.get(np.array([-1, 28]))).all()
-
-
-def test_a_stage_that_begins_anew_is_counted_and_followed() -> None:
-    join = SampleReferenceJoin("linear", ReferenceRing())
-    k = np.arange(100, 110)
-    join.put(k, k * 1e-3, k * 0.0, k * 0.0)
-    join.put(k - 100, (k - 100) * 1e-3, k * 0.0, k * 0.0)
-    got = join.take(everything=True)
-    assert got is not None
-    assert (join.restarts, got.seq.tolist()) == (1, list(range(10)))
-
-
 # -- planes ------------------------------------------------------------------------------------------------------
-
-finite = st.floats(-1e9, 1e9, allow_subnormal=False)
-
-
-@given(st.lists(finite, min_size=1, max_size=20), st.lists(finite, min_size=1, max_size=20))
-@settings(deadline=None)
-def test_limits_only_grow_and_hold_everything(first: list[float], then: list[float]) -> None:
-    one = grown(None, np.array(first))
-    assert one is not None
-    two = grown(one, np.array(then))
-    assert two is not None
-    assert two[0] <= one[0] < one[1] <= two[1]
-    assert two[0] <= min(first + then)
-    assert max(first + then) <= two[1]
-    assert grown(two, np.array(then)) == two
-    marks = ticks(*two)
-    assert 1 <= len(marks) <= 6
-    room = 1e-6 * (two[1] - two[0])
-    assert two[0] - room <= marks[0]
-    assert marks[-1] <= two[1] + room
-
-
-def test_a_plane_turns_y_over() -> None:
-    plane = Plane("voltage, V", "displacement, µm", (0.0, 10.0), (-5.0, 95.0))
-    box = plane.points(np.array([0.0, 10.0, np.nan, 5.0]), np.array([-5.0, 95.0, 1.0, 45.0]))
-    assert box.tolist() == [[0.0, 0.0], [WIDTH, -HEIGHT], [WIDTH / 2, -HEIGHT / 2]]
-    where, what = plane.labels()
-    assert {"voltage, V", "displacement, µm", "0", "10", "80"} <= set(what)
-    # The tick that says 80 stands where 80 µm is drawn, but for the shift of its text.
-    assert where[what.index("80")][1] == pytest.approx(plane.points(np.array([0.0]), np.array([80.0]))[0, 1] - 4.0)
-
-
-def test_limits_that_no_value_can_set() -> None:
-    assert grown(None, np.array([np.nan, np.inf, 1e300])) is None
-    same = grown(None, np.array([3.0, 3.0]))
-    assert same is not None
-    assert same[0] < 3.0 < same[1]
 
 
 # -- scene -------------------------------------------------------------------------------------------------------
@@ -216,20 +149,6 @@ def test_the_mean_error_is_that_of_the_last_half_second_however_the_samples_are_
     assert at_once.values(path)[40] == pytest.approx(expected)
 
 
-def test_without_a_range_percentages_refer_to_the_span_of_the_reference() -> None:
-    memory = drawn([tracking("lssvm_adaptive", 0.6)])
-    assert memory.values("mean_error_pct/lssvm_adaptive")[-1] == pytest.approx(1.0, rel=1e-6)
-
-
-def test_samples_without_a_reference_are_drawn_and_have_no_error() -> None:
-    bare = tracking("lssvm_adaptive", 0.0, n=100)
-    bare = Tracking("lssvm_adaptive", bare.seq, bare.t_s, bare.u_V, bare.y_um, np.full(100, np.nan))
-    memory = drawn([bare])
-    assert len(memory.curves["displacement/lssvm_adaptive_um"]) == 100
-    assert "error_um/lssvm_adaptive" not in memory.curves
-    assert style.REFERENCE not in memory.curves
-
-
 def test_loops_before_and_after_a_change_are_those_of_their_time() -> None:
     before = tracking("lssvm_adaptive", 0.0, n=3000)
     after = tracking("lssvm_adaptive", 5.0, start_s=3.0, n=3000)
@@ -245,32 +164,6 @@ def test_loops_before_and_after_a_change_are_those_of_their_time() -> None:
     u_V, y_um = data(plane, now[0])
     assert t_s > 5.5
     assert y_um == pytest.approx(11.0 * u_V - 5.0)
-
-
-def test_word_of_a_change_that_comes_late_leaves_nothing_from_after_it_in_before() -> None:
-    records = [
-        tracking("lssvm_adaptive", 0.0, n=3000),
-        tracking("lssvm_adaptive", 5.0, start_s=3.0, n=300),
-        Event(3.0, 3000, "change", change=True),
-        tracking("lssvm_adaptive", 5.0, start_s=3.3, n=700),
-    ]
-    memory = drawn(records)
-    u_V, y_um = data(memory.planes[style.LOOP_PLANE], memory.shapes[style.LOOP_BEFORE][-1][1][0])
-    assert len(y_um) > 100
-    assert y_um == pytest.approx(11.0 * u_V)
-
-
-def test_a_second_note_of_the_same_change_does_not_move_it() -> None:
-    records = [
-        tracking("lssvm_adaptive", 0.0, n=3000),
-        Event(3.0, 3000, "change", change=True),
-        tracking("lssvm_adaptive", 5.0, start_s=3.0, n=1000),
-        Event(3.9, 3900, "change noticed", change=True),
-        tracking("lssvm_adaptive", 5.0, start_s=4.0, n=1000),
-    ]
-    memory = drawn(records)
-    u_V, y_um = data(memory.planes[style.LOOP_PLANE], memory.shapes[style.LOOP_BEFORE][-1][1][0])
-    assert y_um == pytest.approx(11.0 * u_V), "that of before the first note"
 
 
 def test_diagnostics_become_curves_rates_and_the_window() -> None:
@@ -326,41 +219,6 @@ def test_nonsense_in_diagnostics_draws_nothing_and_breaks_nothing(fields: dict[s
     assert len(memory.curves["error_um/linear"]) == 50
 
 
-def test_events_status_and_health() -> None:
-    memory = drawn(
-        [
-            Event(1.25, 1250, "drift: gain 0.94", "WARN"),
-            Status(2.0, 2000, {"stage": "demo", "samples": {"learnt": 12, "odd|name": 0.123456789}}),
-            Health(2.0, 2000, {"malformed": 3}),
-        ]
-    )
-    assert memory.texts[style.EVENTS] == [(1.25, "1.250 s  drift: gain 0.94", "WARN")]
-    assert "| samples.learnt | 12 |" in memory.texts[style.STATUS][0][1]
-    assert memory.values("stream/malformed").tolist() == [3.0]
-
-
-def test_a_stage_that_begins_anew_is_drawn_on() -> None:
-    memory = drawn([tracking("lssvm_adaptive", 0.0, start_s=10.0), tracking("lssvm_adaptive", 0.6)], range_um=60.0)
-    assert len(memory.curves[style.REFERENCE]) == 6000
-    assert memory.values("mean_error_pct/lssvm_adaptive")[-1] == pytest.approx(1.0)
-
-
-def test_a_leap_in_time_costs_no_more_than_its_samples() -> None:
-    samples = tracking("lssvm_adaptive", 0.6, n=2000)
-    leaping = np.where(samples.seq < 1000, samples.t_s, samples.t_s + 8e9)
-    leap = Tracking("lssvm_adaptive", samples.seq, leaping, samples.u_V, samples.y_um, samples.reference_um)
-    memory = drawn([leap], range_um=60.0)
-    assert 4 <= len(memory.shapes[style.LOOP_NOW]) <= 10
-    assert len(memory.curves["mean_error_pct/lssvm_adaptive"]) <= 42
-
-
-def test_memory_stays_bounded() -> None:
-    scene = Scene(Memory(), SceneConfig("demo/x", MODELS))
-    for k in range(40):
-        scene.take_all([tracking("lssvm_adaptive", 0.1, start_s=0.5 * k, n=500)])
-    assert len(scene._trails["lssvm_adaptive"].rows) <= 3100
-
-
 @pytest.mark.parametrize(
     ("bad", "field_name"),
     [
@@ -373,9 +231,3 @@ def test_memory_stays_bounded() -> None:
 def test_a_bad_scene_is_refused_by_name(bad: dict[str, Any], field_name: str) -> None:
     with pytest.raises(InputError, match=field_name):
         SceneConfig("demo/x", **{"models": MODELS, **bad})
-
-
-def test_tracking_of_unequal_lengths_is_refused_by_name() -> None:
-    k = np.arange(3)
-    with pytest.raises(InputError, match="y_um"):
-        Tracking("linear", k, k * 1.0, k * 1.0, np.zeros(2), k * 1.0)

@@ -117,16 +117,6 @@ def test_a_file_that_cannot_be_written_is_refused_by_name(tmp_path: Path) -> Non
         Output(config)
 
 
-def test_a_url_that_is_none_is_refused_by_name() -> None:
-    with pytest.raises(InputError, match="connect: got 'nowhere'"):
-        OutputConfig(SceneConfig("demo/x", MODELS), connect="nowhere")
-
-
-def test_a_place_to_draw_is_exactly_one() -> None:
-    with pytest.raises(InputError, match="rrd, connect"):
-        OutputConfig(SceneConfig("demo/x", MODELS))
-
-
 def dead_url() -> tuple[socket.socket, str]:
     """A viewer that takes connections and never answers: worse than one that is not there."""
     listener = socket.create_server(("127.0.0.1", 0))
@@ -181,26 +171,6 @@ def test_drawing_steps_back_behind_those_it_watches(tmp_path: Path) -> None:
         assert not group.exists() or group.read_text().strip()[-6:] in ("", "nice 5")
     finally:
         assert output.close(timeout_s=30.0) is True
-
-
-def test_a_viewer_that_does_not_answer_ends_within_its_time() -> None:
-    listener, url = dead_url()
-    with listener:
-        output = Output(OutputConfig(SceneConfig("demo/x", MODELS), connect=url, queue_batches=50))
-        for k in range(20):
-            output.offer([unit_piece(k)])
-        start = time.perf_counter()
-        output.close(timeout_s=1.0)
-        assert time.perf_counter() - start < 6.0
-
-
-def test_a_spawned_viewer_is_there_and_bound_to_this_machine() -> None:
-    from dehyst.service.viewer.rerun_sink import viewer_command
-
-    command = viewer_command(9876)
-    assert command[command.index("--bind") + 1] == "127.0.0.1"
-    said = subprocess.run([command[0], "--version"], capture_output=True, text=True, timeout=30)
-    assert said.stdout.startswith("rerun-cli 0.41")
 
 
 def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:

@@ -18,18 +18,16 @@ from dehyst.sim.chapter.control import (
     BlockConfig,
     changing,
     chapter_reference,
-    control_references,
     learner_of,
-    moving_mae,
     replay,
     run_control,
     sine_reference,
     track_learning,
     training_reference,
 )
-from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width
-from dehyst.sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs
-from dehyst.sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
+from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments
+from dehyst.sim.chapter.forward_lssvm import fit_two_inputs
+from dehyst.sim.chapter.modelling import ForwardRun, identify_forward, refine_bouc_wen
 from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.closed_loop import track
 from dehyst.sim.stage.presets import preset
@@ -71,14 +69,6 @@ def test_records_are_those_of_the_chapter(rich: Experiments) -> None:
     for record in rich.third:
         assert abs(record.u_V[0]) < 0.05
         assert np.max(np.abs(np.diff(record.u_V))) < 0.3
-
-
-def test_loop_width_of_a_known_loop() -> None:
-    phase = np.linspace(0.0, 2.0 * np.pi, 4001)
-    u = -np.cos(phase)
-    y = 10.0 * u - 3.0 * np.sin(phase)
-    assert loop_width(u, y) == pytest.approx(6.0, rel=1e-3)
-    assert loop_width(u, 10.0 * u) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_loops_widen_with_amplitude_and_frequency(rich: Experiments, chapter: Experiments) -> None:
@@ -160,16 +150,6 @@ def test_swarms_come_near_the_better_route(chapter_runs: list[ForwardRun]) -> No
     assert runs["bouc_wen"].training.rmse_pct < runs["bouc_wen_pso"].training.rmse_pct
 
 
-def test_models_with_memory_run_the_same_in_parts_of_the_input(rich: Experiments) -> None:
-    model = fit_memory(rich.training.u_V, rich.training.coarse_y_um)
-    whole = predict(model, rich.generalisation.u_V)
-    part = predict(model, np.ascontiguousarray(rich.generalisation.u_V[: 200 * EVERY]))
-    # the last sample's rate is a one-sided difference in the part
-    np.testing.assert_allclose(part[:-1], whole[:199], rtol=0.0, atol=1e-9)
-    with pytest.raises(InputError, match="y_um"):
-        fit_memory(rich.training.u_V, rich.training.coarse_y_um[:-1])
-
-
 # --- Control experiments of the chapter, frozen and learning.
 
 
@@ -188,13 +168,6 @@ def test_references_are_their_own_derivatives(make: object) -> None:
     assert reference.y_um.min() >= -1e-9
     assert reference.y_um.max() < 80.0
     assert abs(reference.y_um[0]) < 1e-2
-
-
-def test_references_stay_within_what_was_identified() -> None:
-    data = experiments("rich", quick=True)
-    for reference in control_references(data, quick=True).values():
-        assert reference.y_um.max() < data.training.y_um.max()
-        assert reference.y_um.min() > -0.1
 
 
 def test_blocks_of_a_model_that_does_not_learn_equal_one_run() -> None:
@@ -239,15 +212,6 @@ def test_snapshot_that_answers_has_not_seen_its_block() -> None:
         replay(learner_of(model), motion[:-1], u, y, DT_S)
 
 
-def test_moving_mean_is_of_the_last_half_second() -> None:
-    error = np.zeros(2000)
-    error[1000:1500] = 0.5
-    trace = moving_mae(error, 50.0)
-    assert trace[999] == 0.0
-    assert trace[1499] == pytest.approx(1.0)
-    assert trace[1999] == pytest.approx(0.0, abs=1e-12)
-
-
 def test_control_on_the_rich_stage_meets_its_targets() -> None:
     data = experiments("rich", quick=True)
     control = run_control(data, quick=True)
@@ -275,18 +239,3 @@ def test_an_identified_bouc_wen_is_exact_on_its_own_stage() -> None:
 
 
 # --- Min-max normalisation and its inverse.
-
-
-@pytest.mark.parametrize("data", [np.array([[1.0, -5.0], [3.0, 5.0], [2.0, 0.0]]), np.array([0.0, 4.0, 1.0])])
-def test_range_maps_to_zero_and_one_and_back(data: np.ndarray) -> None:
-    scaling = MinMaxScaling.fit(data)
-    scaled = scaling.normalise(data)
-    assert (scaled.min(axis=0) == 0.0).all()
-    assert (scaled.max(axis=0) == 1.0).all()
-    np.testing.assert_allclose(scaling.denormalise(scaled), data, rtol=1e-12)
-
-
-@pytest.mark.parametrize("data", [np.array([[1.0, 2.0], [1.0, 3.0]]), np.array([[np.nan], [1.0]])])
-def test_data_that_cannot_be_scaled(data: np.ndarray) -> None:
-    with pytest.raises(InputError):
-        MinMaxScaling.fit(data)

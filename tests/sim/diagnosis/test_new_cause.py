@@ -47,7 +47,7 @@ def test_it_is_drawn_and_reported(diagnosis: Diagnosis) -> None:
     shown = picture(diagnosis.causes[0], diagnosis.extended.model.data, diagnosis.catalogue)
     assert {curve.role for curve in shown.curves} == {WITHOUT, WITH}
     assert shown.x_name == "reading / µm"
-    text = page(diagnosis, export_stage(diagnosis), Source("test"), viewer=False)
+    text = page(diagnosis, export_stage(diagnosis), Source("test"))
     assert "**cyclic error**" in text
     assert CYCLIC_ERROR.signature in text
     assert "hold zero" not in text
@@ -56,14 +56,14 @@ def test_it_is_drawn_and_reported(diagnosis: Diagnosis) -> None:
 def test_the_page_says_that_the_size_is_open_where_all_intervals_hold_zero(diagnosis: Diagnosis) -> None:
     wide = {name: (-1.0, 99.0) for name in diagnosis.causes[0].parameters}
     unsure = replace(diagnosis, causes=(replace(diagnosis.causes[0], intervals=wide),))
-    assert "intervals of all its numbers hold zero" in page(unsure, export_stage(unsure), Source("test"), viewer=False)
+    assert "intervals of all its numbers hold zero" in page(unsure, export_stage(unsure), Source("test"))
 
 
 def test_the_page_does_not_say_below_the_bound_of_an_error_above_it(diagnosis: Diagnosis) -> None:
     def told(floors: float) -> str:
         floor = diagnosis.extended_heldout_um / floors
         bound = replace(diagnosis, noise_floor_um=floor, floor_source=DIFFERENCES)
-        return page(bound, export_stage(bound), Source("test"), viewer=False)
+        return page(bound, export_stage(bound), Source("test"))
 
     assert "below the only bound" in told(0.9)
     assert "near the only bound" in told(1.2)
@@ -131,5 +131,5 @@ def test_every_cause_says_what_the_page_says_of_its_direct_test() -> None:
 
 def test_the_page_says_how_much_an_alternative_removes(diagnosis: Diagnosis) -> None:
     either = replace(diagnosis.causes[0], alternatives=("sensor_nonlinearity",), instead={"sensor_nonlinearity": 0.83})
-    text = page(replace(diagnosis, causes=(either,)), export_stage(diagnosis), Source("test"), viewer=False)
+    text = page(replace(diagnosis, causes=(either,)), export_stage(diagnosis), Source("test"))
     assert "cannot tell it from sensor nonlinearity**: of what it removes, sensor nonlinearity removes 83 %" in text

@@ -73,35 +73,6 @@ def test_the_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert max(widths) < 0.2
 
 
-def test_the_noise_comes_from_the_periods() -> None:
-    """White noise of 3 nm on a reading; a slow offset from period to period is not noise of the lines."""
-    rng = np.random.default_rng(2)
-    u = simulated.orthogonal_multisines(rng, 1024, 3, 1, np.arange(1, 461), 0.2)
-    clean = by_state_space(three_by_three(), u)
-    y = clean[..., None] + 0.003 * rng.normal(size=(*clean.shape, 6)) + 0.5 * np.arange(6)
-    spectra = average(PeriodicRecord("noisy", np.repeat(u[..., None], 6, axis=3), y, DT_S))
-    assert np.allclose(spectra.noise_um, 0.003, rtol=0.03)
-    assert np.allclose(spectra.floor_um, 0.003 / np.sqrt(6.0), rtol=0.03)
-    # The variance of a line of the mean period: σ² / (samples · periods).
-    assert np.allclose(spectra.noise.mean(axis=0), 0.003**2 / (1024 * 6), rtol=0.1)
-    assert np.allclose(spectra.signal_um, np.sqrt(np.mean(clean**2, axis=(0, 2))), rtol=1e-3)
-    left = spectra.y - np.fft.rfft(clean, axis=0)[spectra.lines] / 1024
-    assert np.allclose(np.mean(np.abs(left) ** 2, axis=(0, 2)), spectra.noise.mean(axis=0), rtol=0.1)
-
-
-def test_one_period_leaves_the_noise_unknown() -> None:
-    rng = np.random.default_rng(3)
-    u = simulated.orthogonal_multisines(rng, 512, 3, 1, np.arange(1, 231), 0.2)
-    spectra = average(PeriodicRecord("one", u[..., None], by_state_space(three_by_three(), u)[..., None], DT_S))
-    assert np.isnan(spectra.noise_um).all()
-    found = study(
-        [PeriodicRecord("one", u[..., None], by_state_space(three_by_three(), u)[..., None], DT_S)],
-        settings=FitSettings(start_modes=8),
-    )
-    assert any("one period only" in note for note in found.notes)
-    assert found.levels[0].test_um is None
-
-
 def _stage_at_three_amplitudes(kind: str) -> tuple[list[PeriodicRecord], FloatArray]:
     """A mode at 50 Hz with 3 % damping at three amplitudes, and the output's rms at each."""
     records, size = [], []

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dehyst.sim.recordings import Recording, read
-from dehyst.sim.recordings.columns import ColumnMap
 
 N, DT_S = 600, 1e-3
 T_S = np.arange(N) * DT_S
@@ -72,18 +71,6 @@ def test_points_between_thousands_are_left_out_and_said(tmp_path: Path) -> None:
     assert any("thousands separated by points" in note for note in recording.notes)
 
 
-def test_commas_between_thousands_too(tmp_path: Path) -> None:
-    row = '"{t:.3f}","{u:.5f}",{y:.5f}\n'
-    path = written(tmp_path / "r.csv", "t_s;u_V;y_um\n", row.replace(",", ";"))
-    lines = path.read_text().splitlines()
-    lines[1:] = [
-        f"{float(t):.3f};{1e3 * float(u):,.2f};{y}"
-        for t, u, y in (line.replace('"', "").split(";") for line in lines[1:])
-    ]
-    path.write_text("\n".join(["Time (s);Voltage (mV);Position (um)", *lines[1:]]))
-    assert_read(read(path))
-
-
 @pytest.mark.parametrize("word", ["--", "OVRNG", "Overload", "-"])
 def test_words_of_instruments_for_no_reading_are_missing_values(tmp_path: Path, word: str) -> None:
     path = written(tmp_path / "r.csv", "t (s),u (V),y (um)\r\n", "{t:.3f},{u:.5f},{y:.5f}\r\n")
@@ -94,23 +81,6 @@ def test_words_of_instruments_for_no_reading_are_missing_values(tmp_path: Path, 
     recording = read(path)
     assert np.flatnonzero(~np.isfinite(recording.y_um)).tolist() == [100, 300]
     assert np.isfinite(recording.u_V).all()
-
-
-def test_names_that_come_again_between_two_blocks_are_passed_over_and_said(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.csv", "t_s,u_V,y_um\n", "{t:.3f},{u:.5f},{y:.5f}\n")
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:300], "", "", lines[0], *lines[300:]]))
-    recording = read(path)
-    assert_read(recording)
-    assert any("comes again" in note for note in recording.notes)
-
-
-def test_an_index_without_a_name_leaves_the_other_names(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.csv", ",time,drive,sensor\n", "{k},{t:.3f},{u:.5f},{y:.5f}\n")
-    mapping = ColumnMap(
-        columns={"t": "time", "u": "drive", "y": "sensor"}, units={"t": "s", "u": "V", "y": "um"}
-    )  # fmt: skip
-    assert_read(read(path, mapping))
 
 
 def test_afternoon_and_midnight(tmp_path: Path) -> None:

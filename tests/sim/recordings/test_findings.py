@@ -82,13 +82,6 @@ def test_a_long_gap_or_a_step_back_splits_and_the_longest_part_is_taken() -> Non
     assert len(repaired(joined).recording) == 2500
 
 
-@pytest.mark.parametrize(("since", "first_s"), [(0, 1.1), (900, 1.1), (3600, 1.1), (3650, 3.9), (3700, 3.9)])
-def test_of_several_parts_the_one_with_most_of_what_is_asked_for(since: int, first_s: float) -> None:
-    # Rows 0 to 999, 1000 to 3699 and 3700 to 3799: two hundred samples are missing.
-    whole = repaired(without(healthy(), np.r_[1000:1100, 3800:3900]), since)
-    assert whole.recording.t_s[0] == pytest.approx(first_s)
-
-
 def test_doubled_samples_by_time_and_by_value() -> None:
     base = healthy()
     again = np.sort(np.r_[np.arange(4000), 700, 1300])
@@ -173,13 +166,6 @@ def test_all_zero_and_constant_are_refused(column: str, level: float) -> None:
         require_usable(dead, check(dead))
 
 
-def test_too_short() -> None:
-    short = healthy().part(0, 100)
-    with pytest.raises(InputError, match="100 samples: too few"):
-        require_usable(short, check(short))
-    assert kinds(healthy().part(0, 500)) == {"too_short": "warning"}
-
-
 def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
     base = healthy()
     exchanged = replace(base, u_V=base.y_um, y_um=base.u_V)
@@ -226,24 +212,6 @@ def test_jitter_and_wrong_units() -> None:
     assert kinds(replace(base, u_V=base.u_V * 1e-3)) == {"unit": "warning"}
     # Milliseconds that were taken for seconds, or a counter of the samples.
     assert kinds(replace(base, t_s=base.t_s * 1e3, dt_s=base.dt_s * 1e3)) == {"unit": "warning"}
-
-
-def test_a_time_with_too_few_digits_names_the_option() -> None:
-    base = healthy()
-    found = check(replace(base, t_s=np.floor(base.t_s * 100.0 + 1e-6) / 100.0, dt_s=1e-2))
-    assert any("the time has too few digits; state the sample time by --rate" in finding.message for finding in found)
-
-
-def test_columns_of_another_length_are_refused() -> None:
-    with pytest.raises(InputError, match=r"y_um: got shape \(3,\), expected \(2,\)"):
-        Recording(t_s=np.zeros(2), u_V=np.zeros(2), y_um=np.zeros(3), dt_s=1.0)
-
-
-def test_between() -> None:
-    part = healthy().between(1.0, 1.5)
-    assert (len(part), part.t_s[0]) == (500, 1.0)
-    with pytest.raises(InputError, match=r"range: got 9:10 s.*0 to 3\.999 s"):
-        healthy().between(9.0, 10.0)
 
 
 @settings(max_examples=40, deadline=None)

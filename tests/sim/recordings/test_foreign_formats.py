@@ -1,4 +1,4 @@
-"""Recordings of other programs: no header, numpy, two files, periods, MATLAB 7.3, HDF5, TDMS, LVM, Excel."""
+"""Recordings of other programs: no header, numpy, two files, periods, MATLAB 7.3, HDF5, TDMS, Excel."""
 
 from __future__ import annotations
 
@@ -111,43 +111,6 @@ def write_xlsx(path: Path, **sheets: list[list[Any]]) -> Path:
     return path
 
 
-LVM = """LabVIEW Measurement\t
-Writer_Version\t2
-Separator\tTab
-Decimal_Separator\t{decimal}
-Multi_Headings\tYes
-X_Columns\t{columns}
-Time_Pref\tRelative
-***End_of_Header***\t
-"""
-LVM_SEGMENT = """\t
-Channels\t2\t
-Samples\t{n}\t{n}\t
-Y_Unit_Label\t{units}\t
-X_Dimension\tTime\tTime\t
-X0\t0.0\t0.0\t
-Delta_X\t{step}\t{step}\t
-***End_of_Header***\t\t
-X_Value\tdrive\tsensor\tComment
-"""
-
-
-def write_lvm(
-    path: Path, columns: str = "One", decimal: str = ".", units: str = "Volts\tMicrons", cut: int = N
-) -> Path:
-    parts = [LVM.format(columns=columns, decimal=decimal)]
-    for part in (slice(0, cut), slice(cut, N)):
-        rows = [
-            f"{t!r}\t{u!r}\t{y!r}" if columns == "One" else f"\t{u!r}\t{y!r}"
-            for t, u, y in zip(T[part].tolist(), U[part].tolist(), Y[part].tolist(), strict=True)
-        ]
-        if rows:
-            segment = LVM_SEGMENT.format(n=len(rows), units=units, step=repr(DT_S)) + "\n".join(rows) + "\n"
-            parts.append(segment if decimal == "." else segment.replace(".", ","))
-    path.write_text("".join(parts))
-    return path
-
-
 # Text without a header.
 
 
@@ -155,19 +118,6 @@ def test_text_without_names_by_position(tmp_path: Path) -> None:
     recording = read(write_text(tmp_path / "a.csv"), BY_POSITION)
     same(recording)
     assert any("called by their position, from 1" in note for note in recording.notes)
-
-
-def test_text_without_names_with_decimal_commas(tmp_path: Path) -> None:
-    path = write_text(tmp_path / "a.csv", delimiter=";")
-    path.write_text(path.read_text().replace(".", ","))
-    recording = read(path, BY_POSITION)
-    same(recording)
-    assert "text: columns separated by ';', decimal commas" in recording.notes
-    same(read(path, ColumnMap(columns=BY_POSITION.columns, units=BY_POSITION.units, decimal=",")))
-    path.write_text("t_s;u_V;y_um\n" + path.read_text())
-    same(read(path))
-    with pytest.raises(InputError, match=r"no rows of numbers"):
-        read(path, ColumnMap(decimal="."))
 
 
 def test_names_in_the_comment_above_as_numpy_writes_them(tmp_path: Path) -> None:
@@ -225,14 +175,6 @@ def test_a_first_line_that_may_be_names_or_a_sample_needs_the_option(tmp_path: P
         assert len(read(path, whole)) == N + 1
 
 
-def test_names_on_a_later_line(tmp_path: Path) -> None:
-    path = write_text(tmp_path / "a.csv", "scope 7", "2024-05-01,10:00", "t_s,u_V,y_um")
-    same(read(path, ColumnMap(header="3")))
-    for line, message in (("2", "is not a table of 2 columns"), ("999", "beyond the"), ("0", "header: got '0'")):
-        with pytest.raises(InputError, match=message):
-            read(path, ColumnMap(header=line))
-
-
 # numpy.
 
 
@@ -260,15 +202,6 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="holds a pickled Python object, which is never loaded"):
             read(tmp_path / name)
     assert not (tmp_path / "opened").exists()
-
-
-def test_complex_numbers_and_texts_are_no_samples(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", t_s=T, u_V=U * 1j, y_um=Y)
-    with pytest.raises(InputError, match=r"'u_V' for u: got complex numbers"):
-        read(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", t_s=T, u_V=np.array(["off"] * N), y_um=Y)
-    with pytest.raises(InputError, match="got 'off' in data row 1, expected a number"):
-        read(tmp_path / "b.npz")
 
 
 # Two files.
@@ -423,18 +356,6 @@ def test_matlab_7_3_reads_as_the_older_versions_do(tmp_path: Path) -> None:
     assert "names (cells)" in str(caught.value)
 
 
-def test_matlab_7_3_numbers_of_other_kinds(tmp_path: Path) -> None:
-    counts = np.round(Y * 10).astype(np.int16)
-    write_v73(tmp_path / "a.mat", t_s=T, u_V=U.astype(np.float32), y=counts, fs=500.0, on=counts > 0)
-    recording = read(tmp_path / "a.mat", ColumnMap(scale={"y": 0.1}))
-    np.testing.assert_array_equal(recording.u_V, U.astype(np.float32).astype(np.float64))
-    np.testing.assert_array_equal(recording.y_um, counts * 0.1)
-    recording = read(
-        tmp_path / "a.mat", ColumnMap(columns={"rate": "fs", "t": "t_s"}, units={"rate": "Hz"}, scale={"y": 0.1})
-    )
-    assert recording.dt_s == DT_S
-
-
 def test_hdf5_with_groups_and_stated_units(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         run = file.create_group("run1")
@@ -527,94 +448,7 @@ def test_a_name_and_a_stated_unit_that_differ_are_refused(tmp_path: Path) -> Non
     same(read(path, ColumnMap(units={"y": "nm"})), rtol=1e-15)
 
 
-def test_tdms_without_a_sample_time_needs_one(tmp_path: Path) -> None:
-    path = write_tdms(tmp_path / "a.tdms", u_V=(U, {}), y_um=(Y, {}))
-    with pytest.raises(InputError, match=r"no time.*--dt-s"):
-        read(path)
-    with pytest.raises(InputError, match="is the index of a TDMS file"):
-        read(
-            Path(f"{path}_index").rename(tmp_path / "b.tdms_index") if Path(f"{path}_index").exists() else _index(path)
-        )
-
-
-def _index(path: Path) -> Path:
-    index = path.with_suffix(".tdms_index")
-    index.write_bytes(b"TDSh" + path.read_bytes()[4:])
-    return index
-
-
 # LVM.
-
-
-LVM_COLUMNS = {"u": "drive", "y": "sensor"}
-
-
-@pytest.mark.parametrize("columns", ["One", "No"])
-@pytest.mark.parametrize("cut", [N, 100])
-@pytest.mark.parametrize("decimal", [".", ","])
-def test_lvm(tmp_path: Path, columns: str, cut: int, decimal: str) -> None:
-    path = write_lvm(tmp_path / "a.lvm", columns=columns, cut=cut, decimal=decimal)
-    # Without times, the pause between two segments is unknown.
-    unknown = columns == "No" and cut < N
-    recording = read(path, ColumnMap(columns=LVM_COLUMNS, dt_s=DT_S if unknown else None))
-    same(recording)
-    assert ("2 segments put one after another" in recording.notes) == (cut < N)
-    if columns == "One":
-        same(read(path, ColumnMap(columns={"t": "X_Value", **LVM_COLUMNS})))
-
-
-@pytest.mark.parametrize("columns", ["One", "No"])
-def test_lvm_segments_with_a_pause_need_a_time(tmp_path: Path, columns: str) -> None:
-    path = write_lvm(tmp_path / "a.lvm", columns=columns, cut=100)
-    if columns == "One":  # the second one begins a second later
-        lines = path.read_text().splitlines()
-        rows = [k for k, line in enumerate(lines) if line[:1].isdigit()]
-        for k in rows[100:]:
-            t, rest = lines[k].split("\t", 1)
-            lines[k] = f"{float(t) + 1.0!r}\t{rest}"
-        path.write_text("\n".join(lines))
-        recording = read(path, ColumnMap(columns={"t": "X_Value", **LVM_COLUMNS}))
-        assert [finding.kind for finding in check(recording) if finding.kind == "gap"] == ["gap"]
-        # The file states that X_Value is in seconds.
-        again = read(path, ColumnMap(columns=LVM_COLUMNS))
-        np.testing.assert_array_equal(again.t_s, recording.t_s)
-        assert "t is the column 'X_Value', by its unit" in again.notes
-        return
-    with pytest.raises(InputError, match=r"and no time, expected a column t_s: add --column t=NAME"):
-        read(path, ColumnMap(columns=LVM_COLUMNS))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("***End_of_Header***", "***End***", "no line"),
-        ("0.002\t", "off\t", r"'X_Value' for t: got 'off' in data row \d+"),
-        ("Y_Unit_Label\tVolts\tMicrons", "Y_Unit_Label\tVolts\tinch", "states the unit 'inch'"),
-        ("Y_Unit_Label\tVolts\tMicrons", "Y_Unit_Label\tVolts", r"the unit of column 'drive' for u"),
-        ("Delta_X\t0.002\t0.002", "Delta_X\t0.002\t0.004", "sample time of 0.004 s"),
-    ],
-)
-def test_damaged_lvm(tmp_path: Path, old: str, new: str, message: str) -> None:
-    path = write_lvm(tmp_path / "a.lvm")
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(InputError, match=message):
-        read(path, ColumnMap(columns={"u": "drive", "y": "sensor"}))
-
-
-def test_lvm_segments_of_other_channels_and_without_samples(tmp_path: Path) -> None:
-    path = write_lvm(tmp_path / "a.lvm", cut=100)
-    text = path.read_text()
-    at = text.rindex("drive")
-    path.write_text(text[:at] + "other" + text[at + 5 :])
-    with pytest.raises(InputError, match="got channels X_Value, other, sensor, expected X_Value, drive"):
-        read(path)
-    path.write_text(LVM.format(columns="One", decimal=".") + LVM_SEGMENT.format(n=0, units="V\tum", step=DT_S))
-    with pytest.raises(InputError, match="a header line and no samples"):
-        read(path)
-    path.write_text(LVM.format(columns="One", decimal="."))
-    with pytest.raises(InputError, match="got no data after line"):
-        read(path)
 
 
 # Excel.
@@ -662,16 +496,6 @@ def test_xlsx_that_holds_no_recording(tmp_path: Path) -> None:
         read(tmp_path / "d.xls")
 
 
-def test_xlsx_whose_formatted_empty_rows_are_no_samples(tmp_path: Path) -> None:
-    book = openpyxl.Workbook()
-    sheet = book.active
-    for row in [["t_s", "u_V", "y_um"], *TABLE.tolist()]:
-        sheet.append(row)
-    sheet.cell(row=5000, column=9).font = openpyxl.styles.Font(bold=True)
-    book.save(tmp_path / "a.xlsx")
-    same(read(tmp_path / "a.xlsx"))
-
-
 # All of them.
 
 
@@ -691,7 +515,7 @@ def whole_files(folder: Path) -> list[Path]:
         write_v73(folder / "b.mat", t_s=T, u_V=U, y_um=Y),
         write_tdms(folder / "a.tdms", u_V=(U, waveform()), y_um=(Y, waveform())),
         write_xlsx(folder / "a.xlsx", Data=[["t_s", "u_V", "y_um"], *TABLE.tolist()]),
-        write_lvm(folder / "a.lvm", units="V\tum"),
+        write_text(folder / "a.csv", "t_s,u_V,y_um"),
     ]
 
 
@@ -741,7 +565,7 @@ def gives_samples_or_an_input_error(data: st.DataObject, content: bytes, path: P
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)
-@given(data=st.data(), name=st.sampled_from([*(name for name in NAMES if name != "a.mat"), "a.lvm"]))
+@given(data=st.data(), name=st.sampled_from([*(name for name in NAMES if name != "a.mat"), "a.csv"]))
 def test_a_damaged_file_gives_samples_or_an_input_error(
     data: st.DataObject, name: str, contents: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
@@ -36,19 +35,6 @@ def same(recording: Recording) -> None:
     assert recording.dt_s == 0.002
 
 
-def write_gcs(path: Path, *, dim: int = 2, ndata: int = N, sample_time: str = "0.002000", end: bool = True) -> Path:
-    head = ["VERSION = 1", "TYPE = 1", "SEPARATOR = 32", f"DIM = {dim}", f"SAMPLE_TIME = {sample_time}"]
-    head += [f"NDATA = {ndata}", "NAME0 = Control Voltage of Piezo  1", "NAME1 = Current Position of Axis  1"]
-    lines = ["# ", *[f"# {line}" for line in head], "# "] + (["# END_HEADER"] if end else [])
-    path.write_text("\n".join([*lines, *[f"{u:.6f} {y:.6f} " for u, y in zip(U, Y, strict=True)]]) + "\n")
-    return path
-
-
-GCS_MAP = ColumnMap(
-    columns={"u": "Control Voltage of Piezo  1", "y": "Current Position of Axis  1"}, units={"u": "V", "y": "um"}
-)
-
-
 def test_canonical_csv(tmp_path: Path) -> None:
     recording = read(write_csv(tmp_path / "a.csv", "t_s,u_V,y_um,temperature_C", T, U, Y, 20 + T))
     same(recording)
@@ -62,18 +48,6 @@ def test_text_by_its_delimiter_with_comments_before_the_header(tmp_path: Path, d
     path = write_csv(tmp_path / "a.txt", delimiter.join(["t_s", "u_V", "y_um"]), T, U, Y, delimiter=delimiter)
     path.write_text("# rig 7\n% made by hand\n\n" + path.read_text())
     same(read(path))
-
-
-def test_decimal_commas_windows_line_ends_and_a_byte_order_mark(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", "t_s;u_V;y_um", T, U, Y, delimiter=";")
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_text().replace(".", ",").replace("\n", "\r\n").encode())
-    same(read(path, ColumnMap(decimal=",")))
-
-
-def test_other_names_and_units_by_options(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", "time,drive,sensor", T * 1e3, U * 1e3, Y * 1e3)
-    mapping = ColumnMap(columns={"t": "time", "u": "drive", "y": "sensor"}, units={"t": "ms", "u": "mV", "y": "nm"})
-    same(read(path, mapping))
 
 
 def test_a_unit_in_the_name_is_believed(tmp_path: Path) -> None:
@@ -137,35 +111,6 @@ def test_npz_with_several_dimensions_and_a_rate(tmp_path: Path) -> None:
     for bad in (":,3,1", ":,0", "0,0,0", ":,:,0", ":,x,0", ":,-1,0"):
         with pytest.raises(InputError, match="index of y"):
             read(tmp_path / "a.npz", ColumnMap(columns=columns, scale={"u": 1.0}, index={"y": bad}))
-
-
-def test_controllers_array_file(tmp_path: Path) -> None:
-    recording = read(write_gcs(tmp_path / "a.dat"), GCS_MAP)
-    same(recording)
-    assert any("SAMPLE_TIME" in note for note in recording.notes)
-    recording = read(write_gcs(tmp_path / "b.dat", ndata=N + 5), GCS_MAP)
-    assert any("NDATA = 305" in note for note in recording.notes)
-
-
-def test_controllers_array_file_without_stated_units_is_refused(tmp_path: Path) -> None:
-    path = write_gcs(tmp_path / "a.dat")
-    with pytest.raises(InputError, match=r"(?s)the unit of column .* for u: V,.*for y: um"):
-        read(path, ColumnMap(columns=GCS_MAP.columns))
-    with pytest.raises(InputError, match=r"(?s)Control Voltage of Piezo  1, Current Position of Axis  1.*--column u="):
-        read(path)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"dim": 3}, "got 2 columns below the header, expected DIM = 3"),
-        ({"sample_time": "fast"}, "SAMPLE_TIME: got 'fast'.*--dt-s"),
-        ({"end": False}, "END_HEADER"),
-    ],
-)
-def test_damaged_array_files(tmp_path: Path, options: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read(write_gcs(tmp_path / "a.dat", **options), GCS_MAP)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -245,17 +190,6 @@ def test_any_column_order_and_unit_gives_the_same_recording(
     same(read(path, ColumnMap(units=chosen)))
 
 
-@settings(max_examples=60, deadline=None)
-@given(content=st.binary(min_size=1, max_size=300), name=st.sampled_from(["a.csv", "a.mat", "a.npz", "a.parquet"]))
-def test_whatever_the_bytes_only_input_errors_leave(
-    content: bytes, name: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.mktemp("bytes") / name
-    path.write_bytes(content)
-    with pytest.raises(InputError):
-        read(path)
-
-
 def test_measured_files_of_every_folder() -> None:
     data_dir = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
     if not data_dir.is_dir():
@@ -268,10 +202,3 @@ def test_measured_files_of_every_folder() -> None:
     benchmark = ColumnMap(columns={"u": "u_N", "y": "y_m", "rate": "fs_hz"}, scale={"u": 1.0})
     recording = read(data_dir / "boucwen_benchmark" / "test_multisine.npz", benchmark)
     assert float(np.sqrt(np.mean(recording.y_um**2))) == pytest.approx(667.0, rel=0.01)
-
-
-def test_findings_are_json(tmp_path: Path) -> None:
-    from dehyst.sim.recordings import check
-
-    findings = check(read(write_gcs(tmp_path / "b.dat", ndata=N + 5), GCS_MAP))
-    assert json.loads(json.dumps([finding.as_dict() for finding in findings]))
