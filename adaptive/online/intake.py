@@ -38,6 +38,9 @@ from dehyst.adaptive.types import FloatArray, Sample
 
 #: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5
+#: A state holds no motion of more ranges, and no voltage of more times the largest one, than this: such numbers are no
+#: motion of the stage, and overflow in what is computed from them.
+MOST_RANGES = 1e3
 #: Limits of the motion over the smoother's lag, as shares of the motion that the voltage causes by the mean slope;
 #: checked where that is more than this share of the range and this many deviations. Hysteresis is included.
 LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
@@ -702,9 +705,15 @@ class Intake:
         return {"track": track, "_trial": {"base": self.base}, "_control": {"base": self.base}}
 
     @property
-    def sizes(self) -> dict[str, int]:
-        """Names of the dimensions of the state."""
-        return self.base.features.sizes | self.smoother.sizes
+    def sizes(self) -> dict[str, float]:
+        """Sizes of the dimensions of the state by name, and largest magnitudes of motion and voltage by unit."""
+        c = self._admission
+        most_um = MOST_RANGES * (abs(self._middle_um) + self.range_um)
+        most_V = MOST_RANGES * max(abs(c.u_min_V), abs(c.u_max_V), self._drive_V)
+        rates = {"": 1.0, "/s": self.dt_s, "/s²": self.dt_s**2}
+        limits = {f"µm{per}": most_um / step for per, step in rates.items()}
+        limits |= {f"V{per}": most_V / step for per, step in rates.items()}
+        return limits | self.base.features.sizes | self.smoother.sizes
 
     def check_state(self, values: dict[str, Any]) -> None:
         """Raise ValueError where a frame has other sizes than the model."""
