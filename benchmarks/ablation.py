@@ -72,7 +72,7 @@ from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
 from benchmarks.measured import RECORDS, Cut, data_folder, replayed
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner
+from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftConfig, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
@@ -644,6 +644,7 @@ RULES: Final = (
     Rule("the window learns at moving phases", ((learner, "due", _fixed_phase),)),
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
+    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
 )  # fmt: skip
 
 

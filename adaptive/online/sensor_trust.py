@@ -216,6 +216,15 @@ def slope_of(x: FloatArray, y: FloatArray) -> Slope:
     return Slope(slope, float(y.mean() - slope * x.mean()), std, math.sqrt(left / n), share, math.sqrt(xx / n))
 
 
+def correlated(left: FloatArray) -> float:
+    """Factor of the deviation of a slope whose (n,) residuals are smooth, as from ringing or a drift; at least 1.
+
+    Values of an autoregression of first order count for fewer than they are.
+    """
+    alike = min(max(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300), 0.0), 0.99)
+    return math.sqrt((1.0 + alike) / (1.0 - alike))
+
+
 # --- The trial of a suspected sensor.
 
 SENSOR_STUCK = "sensor_stuck"
@@ -244,8 +253,12 @@ NAMED, RENAMED = 3, 24
 #: A slope that differs from 1 by more than this is a change of gain. Two results agree if slopes, and positions as a
 #: share of the range, differ by less than the second value.
 GAIN_STEP, AGREE = 0.02, 0.02
-#: The zero has moved if the shift by the identified model is within these multiples of the shift by dead reckoning.
-ALIKE = (0.5, 2.5)
+#: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
+#: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
+#: both slopes are this close to 1.
+#: Straight lines in time are taken off position and readings, and what is left must agree. It is compared where that of
+#: the position is at least this multiple of the noise of a reading.
+ALIKE, PLAIN, PLAIN_SLOPE, BENDS_SIGMA = (0.5, 2.5), 0.98, 0.12, 2.0
 #: The model is wrong if the readings follow for this many windows without two windows that agree on slope and shift.
 UNCLEAR = 6
 #: Number of windows in which p must follow u; smallest share of the variance and largest slope (or its inverse) for
@@ -307,6 +320,8 @@ class Trial:
     returned: Annotated[int, Entry("evaluations in a row, after a fault, that found the readings right", low=0)] = 0
     slope: Annotated[float, Entry("slope of the readings over the position")] = 1.0
     shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
+    # They may be of another stage.
+    bent: Annotated[int, Entry("1 if readings that seemed shifted bend otherwise than the position", low=0)] = 0
     by_voltages: Annotated[int, Entry("1 if the position is not believed and voltages are compared", low=0)] = 0
 
     @classmethod
@@ -368,6 +383,14 @@ class Trial:
         # Dead reckoning and the identified model show the same shift of the readings: the sensor's zero has moved.
         in_place = abs(off_um) <= tolerance_um(now, self.reckoning)
         zero_moved = follows and not in_place and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
+        slope_error = max(abs(s.slope - 1.0), abs(voltages.slope - 1.0))
+        usual = zero_moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
+        plain = min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE
+        if usual and plain and not self.bent:
+            # A clear shift of usual size, without a fault so far, needs only half a window.
+            self.bent = int(bends_otherwise(x, y, now.noise_um))
+            if not self.bent:
+                return Decision(Outcome.CHANGED, 1.0, off_um)
         fault = _fault(s, float(np.std(y)), allowed)
         if s.swing < TELLS * self.reckoning.std_um:
             # The dead-reckoned position is less certain than the motion is large: only the voltages can decide.
@@ -446,6 +469,25 @@ class Trial:
         self.suspected = fault
         if self.times >= (RENAMED if self.fault else NAMED):
             self.fault, self.why = fault, why
+
+
+def bends_otherwise(x: FloatArray, y: FloatArray, noise: float) -> bool:
+    """Whether (n,) values ``y`` bend in time, and not as the motion ``x`` does. ``noise`` : deviation of a value y.
+
+    Over a short time two motions of the same speed are alike; what is left beside their straight lines tells them
+    apart.
+    """
+    s, std = _of_bends(x, y)
+    return s.swing > BENDS_SIGMA * noise and abs(s.slope - 1.0) > PLAIN_SLOPE + 4.0 * std
+
+
+def _of_bends(x: FloatArray, y: FloatArray) -> tuple[Slope, float]:
+    """The line of (n,) values ``y`` over ``x``, both less their straight lines in time, and the slope's deviation."""
+    t = np.linspace(-1.0, 0.0, x.size)
+    over_x, over_y = slope_of(t, x), slope_of(t, y)
+    dx, dy = x - over_x.slope * t - over_x.constant, y - over_y.slope * t - over_y.constant
+    s = slope_of(dx, dy)
+    return s, s.std * correlated(dy - s.slope * dx)
 
 
 def _fault(s: Slope, spread: float, allowed: bool, unit: str = "um") -> tuple[str, str]:

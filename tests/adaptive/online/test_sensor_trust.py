@@ -33,6 +33,7 @@ from dehyst.adaptive.online.sensor_trust import (
     Following,
     Outcome,
     Trial,
+    bends_otherwise,
     slope_of,
 )
 from dehyst.adaptive.state import load, save
@@ -279,6 +280,17 @@ def test_a_stage_whose_zero_drifts_beside_a_slow_voltage_is_no_fault(sign: float
     assert not any(faults(0.8 * SPAN_V))
     # Faster than the envelope allows, it is a fault; not after the drift is over.
     assert 250 < first(faults(0.4 * SPAN_V)) <= 250 + n
+
+
+@pytest.mark.parametrize(("slope", "bent"), [(1.0, False), (1.08, False), (2.0, True), (-1.0, True)])
+def test_two_motions_of_the_same_speed_are_told_apart_by_their_bends(slope: float, bent: bool) -> None:
+    """A straight way of 3 µm with a bend of 0.1 µm; the readings go the same way, and bend ``slope`` times as much."""
+    t = np.linspace(0.0, 1.0, 40)
+    bend_um = 0.1 * np.sin(2.0 * np.pi * t)
+    noise_um = 0.01 * np.random.default_rng(3).standard_normal(t.size)
+    assert bends_otherwise(3.0 * t + bend_um, 3.0 * t + slope * bend_um + 5.0 + noise_um, 0.01) is bent
+    # Without a bend nothing is told.
+    assert not bends_otherwise(3.0 * t, 3.0 * t + slope * bend_um, 0.01)
 
 
 def test_to_forget_is_to_begin_anew_but_for_the_noise() -> None:
