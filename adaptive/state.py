@@ -26,7 +26,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
 from functools import cache
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from typing import (
     Annotated,
     Any,
@@ -45,7 +45,7 @@ from typing import (
 import numpy as np
 
 from dehyst.adaptive.errors import ModelFileError
-from dehyst.adaptive.types import StateDict, parted
+from dehyst.adaptive.types import FloatArray, StateDict, parted
 
 T = TypeVar("T")
 
@@ -229,14 +229,16 @@ def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
 
 # --- Loading.
 
-Sizes = Mapping[str, int]
+Sizes = Mapping[str, float]
 Given = Mapping[str, Any]
+_NONE: Final[Sizes] = {}
 
 
 def load(cls: type[T], state: Mapping[str, Any], sizes: Sizes | None = None, given: Given | None = None) -> T:
     """A record from its ``save``. Raises ModelFileError with the entry, what it is and what is expected.
 
-    ``sizes`` : of named dimensions. ``given`` : undeclared fields by name; those of a nested record by its field.
+    ``sizes`` : of named dimensions, and by unit the largest magnitude of an entry. ``given`` : undeclared fields by
+    name; those of a nested record by its field.
     """
     return _build(cls, _values_of_all(cls, state, sizes or {}, given or {}), given or {})
 
@@ -301,7 +303,7 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
     for slot in _slots(cls):
         name, of, below = slot.name, slot.of, given.get(slot.field, {})
         if slot.kind == "number":
-            values[slot.field] = _number(of, _leaf(parts, name), slot.entry, name)
+            values[slot.field] = _number(of, _leaf(parts, name), slot.entry, name, sizes)
         elif slot.kind == "array" and slot.optional and name not in parts:
             values[slot.field] = None
         elif slot.kind in ("array", "arrays", "values"):
@@ -349,9 +351,11 @@ def _one(slot: _Slot, value: Any, name: str) -> Any:
     return _sequence(slot._replace(kind="array", name=name), value, {}, {})
 
 
-def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
+def _number(of: Any, value: Any, entry: Entry, name: str, sizes: Sizes = _NONE) -> Any:
     """``value`` as a number, truth value or text of the type ``of``."""
-    if of is type(value) is float and -MOST_FLOAT <= value <= MOST_FLOAT and entry.low <= value <= entry.high:
+    bounded = entry.finite or entry.unit in sizes
+    most = sizes.get(entry.unit, MOST_FLOAT)
+    if of is type(value) is float and -most <= value <= most and entry.low <= value <= entry.high:
         return value  # most are
     # JSON has no NaN: a file stores it as an array of shape ().
     if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.shape == () and value.dtype == float):
@@ -369,10 +373,10 @@ def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
     if type(value) is int and abs(value) > MOST_INT:
         raise Refused(name, str(value)[:40], "an integer from -3 x 2^61 to 3 x 2^61")
     if isfinite(value):
-        small = of is int or not entry.finite or abs(value) <= MOST_FLOAT
+        small = of is int or not bounded or abs(value) <= most
         if not (entry.low <= value <= entry.high and small):
-            raise Refused(name, repr(value), f"a number {_range(entry) or f'of at most {MOST_FLOAT:g}'}")
-    elif entry.finite:
+            raise Refused(name, repr(value), f"a number {_range(entry, most)}")
+    elif entry.finite or (bounded and not isnan(value)):
         raise Refused(name, repr(value), _NUMBERS[of])
     return of(value)
 
@@ -383,13 +387,15 @@ def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> A
     if not isinstance(value, np.ndarray) or value.dtype != dtype or not _fits(slot, value.shape, sizes, bound):
         raise Refused(name, _words(value), f"an array of {dtype}, a shape of {_shapes(slot, sizes, bound)}")
     if value.size and dtype.kind != "b":
-        known = value if entry.finite or dtype.kind != "f" else value[np.isfinite(value)]
-        limit = MOST_FLOAT if dtype.kind == "f" else MOST_INT
-        low, high = max(entry.low, -limit), min(entry.high, limit)
+        most = _most(entry, value.shape, sizes) if dtype.kind == "f" else np.array(MOST_INT)
         # NaN is in no range.
-        if known.size and not (low <= known.min() and known.max() <= high):
-            expected = f"finite numbers {_range(entry) or f'of at most {limit:g}'}"
-            raise Refused(name, f"elements from {known.min():g} to {known.max():g}", expected)
+        fits = (np.maximum(entry.low, -most) <= value) & (value <= np.minimum(entry.high, most))
+        if not entry.finite and dtype.kind == "f":
+            fits |= np.isnan(value) | (np.isinf(value) & (most == MOST_FLOAT))
+        if not fits.all():
+            wrong = value[~fits]
+            expected = f"finite numbers {_range(entry, float(most.min()))}"
+            raise Refused(name, f"elements from {wrong.min():g} to {wrong.max():g}", expected)
     if slot.kind == "array":
         return np.array(value, order="C")
     if slot.kind == "arrays":
@@ -397,6 +403,17 @@ def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> A
     if slot.optional and not value.size:
         return None
     return slot.make(value.tolist() if value.ndim == 1 else map(tuple, value.tolist()))
+
+
+def _most(entry: Entry, shape: tuple[int, ...], sizes: Sizes) -> FloatArray:
+    """Largest magnitude of each element, to be broadcast: an entry may have a unit for each row, or each column."""
+    units = entry.unit.split(", ")
+    if not any(unit in sizes for unit in units):
+        return np.array(MOST_FLOAT)
+    most = np.array([sizes.get(unit, MOST_FLOAT) for unit in units])
+    if most.size == 1:
+        return most
+    return most[:, np.newaxis] if shape[0] == most.size and len(shape) > 1 else most.repeat(shape[-1] // most.size)
 
 
 def _fits(slot: _Slot, got: tuple[int, ...], sizes: Sizes, bound: dict[str, int]) -> bool:
@@ -418,10 +435,13 @@ def _shapes(slot: _Slot, sizes: Sizes, bound: dict[str, int]) -> str:
     return " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in named)
 
 
-def _range(entry: Entry) -> str:
+def _range(entry: Entry, most: float = inf) -> str:
+    """The range in words; ``most`` : largest magnitude where the entry declares no range of its own."""
     if entry.low > -inf:
-        return f"from {entry.low:g}" + (f" to {entry.high:g}" if entry.high < inf else "")
-    return f"up to {entry.high:g}" if entry.high < inf else ""
+        return f"from {entry.low:g}" + (f" to {min(entry.high, most):g}" if min(entry.high, most) < inf else "")
+    if entry.high < inf:
+        return f"up to {min(entry.high, most):g}"
+    return f"of at most {most:g}" if most < inf else ""
 
 
 def _words(value: Any) -> str:

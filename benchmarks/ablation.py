@@ -621,7 +621,6 @@ RULES: Final = (
     Rule("motion not yet learnt is not judged", ((intake, "is_known", _always(True)),)),
     Rule("only a model with credit judges", ((Intake, "_judges", _always_judges), (Intake, "_check_model", _nothing))),
     Rule("a model judges at all", ((Intake, "_judges", _always(False)), (Intake, "_check_model", _nothing))),
-    Rule("readings that lag are held", ((Intake, "_lags", _always(False)),)),
     Rule("repeated readings are none", ((gates, "check_repeats", _always("")),)),
     Rule("readings must follow the drive", ((Intake, "follow", _always(False)),)),
     Rule("undecided readings go on trial", ((Intake, "_give_up", _begin_anew),)),

@@ -17,7 +17,7 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureArrays
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import answers, drive_V, mean_slope
+from dehyst.adaptive.online.dead_reckoning import answers, drive_V
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
 from dehyst.adaptive.online.learner import MARK_S, REFERENCE_S, Learner
@@ -178,7 +178,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         reach_V = template.parts.allowed_V - shape * drive_V(template.base)
         axes.append({
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
-            "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
+            "drive_V": drive_V(base), "tells": answers(base),
             "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0,
             "model": number,
         })  # fmt: skip

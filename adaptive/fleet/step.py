@@ -88,17 +88,6 @@ def _remember_place(s: Rows, b: int, keep: bool) -> None:
 
 
 @compiled
-def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
-    """`Intake._lags`: whether the reading has not moved with the voltage, by a rough measure."""
-    r, front, f, slots = s.numbers[b], s.numbers[b].front, c.axis[b], s.voltages.shape[1]
-    if not (f.tells and front.credit > 0) or r.past_count == 0 or front.gates.since_start < front.look_from:
-        return False
-    last, first = front.track.smoother.count - 1, front.track.smoother.count + 1 - slots
-    x_um = (s.voltages[b, last % slots] - s.voltages[b, first % slots]) / f.slope_V_per_um
-    return bool(intake.lags(front.gates, x_um, y_um - s.readings[b, (first + 1) % slots], f.range_um))
-
-
-@compiled
 def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
     """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
     front, f, a = s.numbers[b].front, c.axis[b], c.config[0].admission
@@ -121,8 +110,6 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
     slope, bend = s.drive_x[b, 1] * c.output_scale[1], s.drive_x[b, 2] * c.output_scale[2]
     known = g.since_start > a.settle and intake.is_known(s.known[b, 0], slope, bend)
     if refused != "" or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
-        return DOUBT
-    if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
         return DOUBT
     gates.watch_innovation(a, g, innovation)
     front["until_control"] -= 1

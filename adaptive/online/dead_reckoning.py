@@ -64,7 +64,9 @@ class Reckoning:
 
     model: Annotated[LssvmInverse, Entry("an immutable snapshot, which reckons the place")]
     memory: Annotated[FloatArray, Entry("hysteresis memory after the last sample", "µm", "m")]
-    numbers: Annotated[FloatArray, Entry("place, voltage, band and uncertainty, in the order of `Reckoning`", "", "11")]
+    numbers: Annotated[
+        FloatArray, Entry("as listed by `Reckoning`", "µm, µm/s, µm/s², V, µm, µm, µm, µm, µm, V/µm, V", "11")
+    ]
 
     def check_state(self) -> None:
         """Raise ValueError where the memory is not of the model."""

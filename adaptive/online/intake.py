@@ -38,11 +38,9 @@ from dehyst.adaptive.types import FloatArray, Sample
 
 #: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5
-#: Limits of the motion over the smoother's lag, as shares of the motion that the voltage causes by the mean slope;
-#: checked where that is more than this share of the range and this many deviations. Hysteresis is included.
-LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
-#: Time between two such checks, s.
-LOOK_S = 0.002
+#: A state holds no motion of more ranges, and no voltage of more times the largest one, than this: such numbers are no
+#: motion of the stage, and overflow in what is computed from them.
+MOST_RANGES = 1e3
 #: A reading that repeats for this time, s, while the voltage moves, is a fault of the sensor and no missing reading.
 REPEATED_S = 0.1
 #: Share of the identified range beyond its ends up to which the model is valid.
@@ -71,14 +69,6 @@ def is_known(known: FloatArray, slope: float, bend: float) -> bool:
     return bool(abs(slope) <= BEYOND * known[0] and abs(bend) <= BEYOND * known[1])
 
 
-@shared
-def lags(gates: AdmissionState, x_um: float, dy_um: float, range_um: float) -> bool:
-    """Whether the reading has moved by ``dy_um`` while the voltage stands for ``x_um``, far beyond the usual error."""
-    if abs(x_um) <= LAGS_SHARE * range_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
-        return False
-    return bool(abs(x_um) > LAGS_SIGMA * gates.innovation2**0.5 * range_um)
-
-
 class Intake:
     """The intake of a learner; ``base`` is the identified model."""
 
@@ -99,7 +89,6 @@ class Intake:
     _calm: Annotated[int, Entry("samples since readings were last held back", low=0)]
     _credit: Annotated[int, Entry("passed control trials; without any the model judges no sensor", high=CREDIT)]
     _until_control: Annotated[int, Entry("samples until the next control trial")]
-    _look_from: Annotated[int, Entry("samples since the start from which on it is looked again for lags", low=0)]
     _reckoned_seq: Annotated[int, Entry("the last sample that has advanced the place", low=-1)]
     restarts: Annotated[int, Entry("restarts of the smoother", low=0)]
     jumps: Annotated[int, Entry("jumps taken", low=0)]
@@ -118,8 +107,6 @@ class Intake:
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.missing = None
-        self._look_every = max(1, round(LOOK_S / self.dt_s))
-        self._least_um = LAGS_SHARE * self.range_um
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
         self._envelope = config.envelope
@@ -132,14 +119,13 @@ class Intake:
         self._calm = 1_000_000  # Samples since readings were last held back.
         # A model that does not depend on the displacement cannot check a sensor.
         self._tells = answers(base)
-        self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
+        self._drive_V = drive_V(base)
         self.known = known_rates(base)
         # A control trial judges readings that are trusted. A fault that it finds is the model's, and costs the model
         # credit: without credit the model may not judge the sensor. Samples until the next control trial.
         self._control = None
         self._credit, self._until_control = FIRST_CREDIT, 0
         self._reckoned_seq = -1  # The last sample that has advanced the place, with a reading or without.
-        self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
         # Places from before the last steps in which the readings followed the drive, the older one first.
         self._pasts = []
 
@@ -220,8 +206,6 @@ class Intake:
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and gates.since_start > c.settle and is_known(self.known[0], *track.rates_now)
         limit = admission.surprise(c, gates, self.base.span_V)
-        if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
-            self._hold = self._lagging(track, model(), sample.y_um)
         doubtful = known and abs(innovation) > limit
         # Held readings count too, except while they ring: an error that repeats becomes the usual error.
         if self._hold is None or not self._hold.rang:
@@ -308,7 +292,6 @@ class Intake:
         self._hold, self._trial, self._lost = None, None, False
         self._proven_past = None
         self.gates.restart()
-        self._look_from = 0
         self._forget()
         if self.track is None:
             self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
@@ -346,31 +329,6 @@ class Intake:
     def _give_credit(self, credit: int) -> None:
         # A model that fails every second time would get credit now and then, and accuse a good sensor with it.
         self._credit = min(max(self._credit + (credit if credit >= 0 else FAILURE * credit), -CREDIT), CREDIT)
-
-    def _lags(self, track: Track, y_um: float) -> bool:
-        """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
-
-        A sensor that stops gently surprises no smoother.
-        """
-        if not self._judges or not self._pasts or self.gates.since_start < self._look_from:
-            return False
-        du_V, dy_um = track.steps_over_lag(y_um)
-        return lags(self.gates, du_V / self._slope_V_per_um, dy_um, self.range_um)
-
-    def _lagging(self, track: Track, model: LssvmInverse, y_um: float) -> Hold | None:
-        """A hold, if the reading has not moved as the place has by reckoning: where the stage turns it moves little."""
-        past, lag = self._clean_past(), track.lag
-        reckoning = _from_past(past, self._of_track(track, model), len(past.u_V) - lag)
-        before_um = reckoning.y_um
-        for u in past.u_V[max(len(past.u_V) - lag, 0) :]:
-            reckoning.advance(u)
-        known = reckoning.std_um <= self._least_um
-        reckoning.begin_way()
-        dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
-        if known and abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
-            return Hold(reckoning, reckoning.y_um)
-        self._look_from = self.gates.since_start + lag
-        return None
 
     def _begin_hold(self, track: Track, model: LssvmInverse, past: bool = False) -> Hold:
         """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed.
@@ -702,9 +660,15 @@ class Intake:
         return {"track": track, "_trial": {"base": self.base}, "_control": {"base": self.base}}
 
     @property
-    def sizes(self) -> dict[str, int]:
-        """Names of the dimensions of the state."""
-        return self.base.features.sizes | self.smoother.sizes
+    def sizes(self) -> dict[str, float]:
+        """Sizes of the dimensions of the state by name, and largest magnitudes of motion and voltage by unit."""
+        c = self._admission
+        most_um = MOST_RANGES * (abs(self._middle_um) + self.range_um)
+        most_V = MOST_RANGES * max(abs(c.u_min_V), abs(c.u_max_V), self._drive_V)
+        rates = {"": 1.0, "/s": self.dt_s, "/s²": self.dt_s**2}
+        limits = {f"µm{per}": most_um / step for per, step in rates.items()}
+        limits |= {f"V{per}": most_V / step for per, step in rates.items()}
+        return limits | self.base.features.sizes | self.smoother.sizes
 
     def check_state(self, values: dict[str, Any]) -> None:
         """Raise ValueError where a frame has other sizes than the model."""
@@ -722,11 +686,10 @@ def known_rates(base: LssvmInverse) -> FloatArray:
     return np.tile(fastest, (3, 1))
 
 
-def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:
-    """From a place in the past over the voltages since; over the first ``upto`` of them where that is given."""
+def _from_past(past: Past, model: LssvmInverse) -> Reckoning:
+    """From a place in the past over the voltages since."""
     reckoning = Reckoning.begin(model, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
-    for u in past.u_V if upto is None else past.u_V[: max(upto, 0)]:
+    for u in past.u_V:
         reckoning.advance(u)
-    if upto is None:
-        reckoning.begin_way()
+    reckoning.begin_way()
     return reckoning

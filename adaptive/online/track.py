@@ -229,13 +229,6 @@ class Track:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""
         self.memory, self.frozen_memory = memory.copy(), self.served.memory_in(self.base, memory)
 
-    def steps_over_lag(self, y_um: float) -> tuple[float, float]:
-        """By how much the voltage, V, and with a next reading ``y_um`` the readings, µm, have moved over the lag."""
-        slots, last = self.u_V.shape[0], self.state.count - 1
-        first = last - self.lag
-        du_V: float = self.u_V.item(last % slots) - self.u_V.item(first % slots)
-        return du_V, y_um - self.y_um.item((first + 1) % slots)
-
     def since_motion(self) -> tuple[Motion, float, FloatArray, FloatArray]:
         """The last smoothed motion, in the frame that is served, its voltage, and (lag,) voltages and readings since.
 

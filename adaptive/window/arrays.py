@@ -51,10 +51,9 @@ class WindowArrays(NamedTuple):
 
 
 # Rows of V. Y: targets. W: noise weights. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
-# PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. The others are scratch. The
-# last row is not used now, has its place in states.
+# PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. The others are scratch.
 Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K = range(12)
-ROWS = 13
+ROWS = 12
 
 # Rows of U. UNDO_POINT: beta, then the features of the slot.
 UNDO_S, UNDO_SY, UNDO_ALPHA, UNDO_R, UNDO_POINT = range(5)
@@ -64,8 +63,7 @@ UNDO_ROWS = 5
 GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, BETA, GRAM = range(9)
 FLOATS = 9
 
-# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE and the last: not used now, have their
-# place in states.
+# Elements of C. UNDO: kind of the step that can be taken back.
 (
     COUNT,
     FORM,
@@ -81,16 +79,15 @@ FLOATS = 9
     REFRESHES,
     UNDONE,
     ROUNDS,
-    UNDO_PLACE,
-) = range(15)
-COUNTERS = 16
+) = range(14)
+COUNTERS = 14
 #: In the Cholesky form, which has no pending term: replacements since the factor was copied to ``kept``; 0 without one.
 LOGGED = PENDING
 #: So many replacements share a copy of the factor. A refused step makes all but the last of them once more.
 KEPT_STEPS = 16
 
 #: The counters that add up over a window's life.
-EVENTS = slice(STEPS, UNDO_PLACE)
+EVENTS = slice(STEPS, COUNTERS)
 
 #: Largest size of a feature or a target that is taken. They are normalised, of order 1.
 MOST = 1e9

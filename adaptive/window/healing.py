@@ -93,7 +93,7 @@ class Refresh:
             if copy.append(np.ascontiguousarray(source.X[:, slot]), y[slot], w[slot]) != ws.ACCEPTED:
                 return False
         copy.arrays.V[ws.Y, :n] = y[:n]
-        copy.arrays.C[ws.CURSOR : ws.UNDO_PLACE] = source.C[ws.CURSOR : ws.UNDO_PLACE]
+        copy.arrays.C[ws.CURSOR :] = source.C[ws.CURSOR :]
         copy.arrays.C[ws.REFRESHES] += 1
         copy.arrays.F[ws.RESIDUAL : ws.LAST_WORST + 1] = source.F[ws.RESIDUAL : ws.LAST_WORST + 1]
         if not steps.resum(copy.arrays):

@@ -117,7 +117,7 @@ class SolverState:
         """Raise ValueError where counters or places would lead out of the arrays."""
         d, n = self.X.shape
         C = self.C.tolist()
-        places = (ws.COUNT, ws.UNDO_SLOT, ws.CURSOR, ws.UNDO_PLACE)
+        places = (ws.COUNT, ws.UNDO_SLOT, ws.CURSOR)
         if max(C[place] for place in places) > n:
             raise ValueError(f"C: got {C}, expected at most the window's {n} samples")
         if C[ws.COUNT] < 0 or not 0 <= C[ws.FORM] <= 1 or C[ws.CURSOR] < 0:

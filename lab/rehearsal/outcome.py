@@ -34,7 +34,8 @@ REST_PER_S: Final = 0.02
 #: change is believed. A change that is not held back within this time, s, is followed without a decision.
 UNDECIDED: Final = frozenset({GLITCH, UNTRUSTED})
 NOTICED_S: Final = 0.05
-#: Error allowed during a sensor fault: percent of the range, or this multiple of the frozen model's error.
+#: Error allowed during a sensor fault: percent of the range, or this multiple of the error of the better of two models
+#: that do not learn: the identified one, and the last estimate before the fault.
 SENSOR_PCT, SENSOR_FACTOR = 1.0, 1.5
 
 
@@ -95,8 +96,10 @@ class Outcome:
     event : what happened. text : its description. category : INTACT or SENSOR. left_out : why it did not happen.
     adaptive, frozen : the two models. worst_ratio : worst half second of the adaptive model over that of the frozen
     one.
+    sensor_ratio : mean error during a sensor fault over that of the better of the frozen model and of the last estimate
+    before the fault; NaN for other events.
     sensor_excess : during a sensor fault, the largest mean error over half a second as a share of what is allowed (the
-    larger of 1 % and 1.5 times the frozen model's in the same half second); NaN for other events.
+    larger of 1 % and 1.5 times that of the better one in the same half second); NaN for other events.
     troubles : in the order in which they began. false_troubles : names of those that began before anything had
     happened.
     healthy_s : how long nothing had happened, s.
@@ -115,6 +118,7 @@ class Outcome:
     adaptive: ErrorFigures
     frozen: ErrorFigures
     worst_ratio: float
+    sensor_ratio: float
     sensor_excess: float
     troubles: tuple[Trouble, ...]
     false_troubles: tuple[str, ...]
@@ -184,12 +188,19 @@ def figures(course: LoopRecord, event: Event, range_um: float, limits: Limits, d
 
 
 def outcome(
-    event: Event, adaptive: LoopRecord, frozen: LoopRecord, range_um: float, limits: Limits, dt_s: float, left_out: str
-) -> Outcome:
-    """The outcome of a run; both records have the same reference."""
+    event: Event, adaptive: LoopRecord, frozen: LoopRecord, last: LoopRecord | None, range_um: float, limits: Limits,
+    dt_s: float, left_out: str,
+) -> Outcome:  # fmt: skip
+    """The outcome of a run; all records have the same reference. ``last`` : of the last estimate before a sensor fault,
+    None for other events."""
     one, other = (figures(course, event, range_um, limits, dt_s) for course in (adaptive, frozen))
     troubles = _troubles(adaptive, event, range_um, dt_s)
     sensor = event.category == SENSOR
+    ratio = excess = float("nan")
+    if last is not None:
+        better_pct = min(other.during_pct, figures(last, event, range_um, limits, dt_s).during_pct)
+        ratio = one.during_pct / max(better_pct, 1e-12)
+        excess = _sensor_excess(adaptive, (frozen, last), event, range_um, dt_s)
     healthy_s = adaptive.t_s.size * dt_s if event.kind == "none" else event.at_s
     # A report before or after a sensor fault is not about it.
     true = [t for t in troubles if sensor and 0.0 <= t.named_s <= event.over_s]
@@ -201,7 +212,8 @@ def outcome(
         adaptive=one,
         frozen=other,
         worst_ratio=one.worst_half_second_pct / max(other.worst_half_second_pct, 1e-12),
-        sensor_excess=_sensor_excess(adaptive, frozen, event, range_um, dt_s) if sensor else float("nan"),
+        sensor_ratio=ratio,
+        sensor_excess=excess,
         troubles=troubles,
         false_troubles=tuple(t.name for t in troubles if t.named_s + event.at_s < healthy_s),
         healthy_s=healthy_s,
@@ -313,8 +325,10 @@ def _troubles(course: LoopRecord, event: Event, range_um: float, dt_s: float) ->
     return tuple(found)
 
 
-def _sensor_excess(adaptive: LoopRecord, frozen: LoopRecord, event: Event, range_um: float, dt_s: float) -> float:
+def _sensor_excess(
+    adaptive: LoopRecord, others: tuple[LoopRecord, LoopRecord], event: Event, range_um: float, dt_s: float
+) -> float:
     part = slice(round(event.at_s / dt_s), round(event.end_s / dt_s))
     window = max(1, round(WINDOW_S / dt_s))
-    one, other = (moving_mean(_error_pct(course, range_um)[part], window) for course in (adaptive, frozen))
-    return float((one / np.maximum(SENSOR_PCT, SENSOR_FACTOR * other)).max())
+    one, *rest = (moving_mean(_error_pct(course, range_um)[part], window) for course in (adaptive, *others))
+    return float((one / np.maximum(SENSOR_PCT, SENSOR_FACTOR * np.minimum(*rest))).max())

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.lab.rehearsal.config import RehearsalConfig
 from dehyst.lab.rehearsal.disturbance import (
     REFERENCE,
@@ -38,6 +38,7 @@ from dehyst.lab.rehearsal.outcome import (
 from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
 from dehyst.lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
 from dehyst.lab.rehearsal.runs import LoopRecord, idle_samples, run_adaptive, run_frozen, times
+from dehyst.service.answers.answering import Served
 from dehyst.service.config.settings import LEARN, AxisConfig
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.reports import tables
@@ -57,12 +58,16 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class EventRun:
-    """One event: the records of the learning and of the frozen model, and their outcome."""
+    """One event: the records of the learning and of the frozen model, and their outcome.
+
+    last : of a sensor fault, the record in which the model that answered just before it answers to the end.
+    """
 
     event: Event
     range_um: float
     adaptive: LoopRecord
     frozen: LoopRecord
+    last: LoopRecord | None
     outcome: Outcome
 
 
@@ -141,13 +146,17 @@ def run_event(
     """The closed loop with one event, learning and frozen. Raises as `rehearse` does."""
     course = _Course.prepared(plant_factory, known, config, event, event.end_s + config.after_s, seed)
     learning = course.new_plant()
-    adaptive = course.run_adaptive(learning, progress)
-    frozen = run_frozen(
-        known.models[LEARN], course.new_plant(), course.wanted, course.low_V, course.axis.limits, config.block
-    )
+    adaptive, before = course.run_adaptive(learning, progress)
+    identified = known.models[LEARN]
+    frozen = course.run_frozen(identified, identified.rest_memory(float(course.wanted.y_um[0])), np.empty(0))
+    last = None
+    if event.category == SENSOR:
+        led = max(0, before.seq - course.first_number + 1)
+        last = course.run_frozen(before.models[before.default], before.memories[before.default], adaptive.u_V[:led])
     progress(1.0)
-    result = outcome(event, adaptive, frozen, course.range_um, course.axis.limits, known.dt_s, learning.left_out)
-    return EventRun(event, course.range_um, adaptive, frozen, result)
+    limits, range_um = course.axis.limits, course.range_um
+    result = outcome(event, adaptive, frozen, last, range_um, limits, known.dt_s, learning.left_out)
+    return EventRun(event, range_um, adaptive, frozen, last, result)
 
 
 def run_healthy(
@@ -157,7 +166,7 @@ def run_healthy(
     does."""
     event = Event("none", "none", HEALTHY_AT_S)
     course = _Course.prepared(plant_factory, known, config, event, duration_s, seed)
-    record = course.run_adaptive(course.new_plant())
+    record, _ = course.run_adaptive(course.new_plant())
     return healthy_outcome(event, record, course.range_um, course.axis.limits, known.dt_s)
 
 
@@ -218,14 +227,29 @@ class _Course:
         go_to_lowest(plant, self.low_V)
         return DisturbedPlant(plant, self.event, self.scale)
 
-    def run_adaptive(self, plant: DisturbedPlant, progress: Callable[[float], None] = lambda _: None) -> LoopRecord:
-        """Close the loop over ``plant``; once only, for the axis learns."""
+    def run_adaptive(
+        self, plant: DisturbedPlant, progress: Callable[[float], None] = lambda _: None
+    ) -> tuple[LoopRecord, Served]:
+        """Close the loop over ``plant``; once only, for the axis learns. Also the last snapshot before the event."""
         n, dt_s, event = self.wanted.y_um.size, self.axis.dt_s, self.event
-        return run_adaptive(
+        before = self.axis.newest
+
+        def note(done: int) -> None:
+            nonlocal before
+            if done <= round(event.at_s / dt_s):
+                before = self.axis.newest
+            if done % (100 * self.block) == 0:
+                progress(done / n)
+
+        record = run_adaptive(
             self.axis, plant, DisturbedSensor(event, self.scale, dt_s, n), MessageLine(event, dt_s, self.first_number),
-            self.wanted, self.low_V, self.block, self.first_number,
-            lambda done: progress(done / n) if done % (100 * self.block) == 0 else None,
+            self.wanted, self.low_V, self.block, self.first_number, note,
         )  # fmt: skip
+        return record, before
+
+    def run_frozen(self, model: InverseModel, memory: FloatArray, led_V: FloatArray) -> LoopRecord:
+        """A new plant and one model that does not learn; see `runs.run_frozen`."""
+        return run_frozen(model, memory, self.new_plant(), self.wanted, self.low_V, led_V, self.axis.limits, self.block)
 
 
 def _axis_config(known: IdentifiedPlant, config: RehearsalConfig) -> AxisConfig:
@@ -290,7 +314,7 @@ def table(rehearsal: Rehearsal, markdown: bool = False) -> str:
         "errors: mean absolute, % of the commanded range; identified: "
         f"{known.low_um:.4g} to {known.high_um:.4g} µm, off by {known.heldout_mae_pct:.3f} % of the voltage span",
         "named after: motion, s, until the axis said that the sensor is wrong; in order is then an error up to "
-        f"{SENSOR_PCT:g} % or {SENSOR_FACTOR:g} times the frozen model's",
+        f"{SENSOR_PCT:g} % or {SENSOR_FACTOR:g} times that of the better of frozen model and last estimate before it",
     ]
     return "\n".join(lines)
 

@@ -138,14 +138,22 @@ def run_adaptive(
 
 
 def run_frozen(
-    model: InverseModel, plant: DisturbedPlant, wanted: Motion, u_before_V: float, limits: Limits, block: int
-) -> LoopRecord:
-    """The same without learning: the identified model alone, its memory follows the reference, not the readings."""
-    n = wanted.y_um.size
+    model: InverseModel, memory: FloatArray, plant: DisturbedPlant, wanted: Motion, u_rest_V: float, led_V: FloatArray,
+    limits: Limits, block: int,
+) -> LoopRecord:  # fmt: skip
+    """The same without learning: one model alone, whose memory follows the reference, not the readings.
+
+    ``led_V``: (k,) voltages of the first samples, V. ``memory``: (m,) of the model after them. ``u_rest_V``: applied
+    before the first sample, V.
+    """
+    n, led = wanted.y_um.size, led_V.size
     idle = idle_samples(model.dt_s, block)
-    plant.run(-idle, np.full(idle, u_before_V))
-    answer = model.feedforward(*wanted, model.rest_memory(float(wanted.y_um[0])))
-    u_V, flags = guard(answer.u_V, answer.inside, model.dt_s, limits, u_before_V)
+    plant.run(-idle, np.full(idle, u_rest_V))
+    own = Motion(*(values[led:] for values in wanted))
+    answer = model.feedforward(*own, memory)
+    before_V = float(led_V[-1]) if led else u_rest_V
+    own_V, own_flags = guard(answer.u_V, answer.inside, model.dt_s, limits, before_V)
+    u_V, flags = np.concatenate([led_V, own_V]), np.concatenate([np.zeros(led, dtype=np.uint8), own_flags])
     true_um, read_um = plant.run(0, u_V)
     none = np.zeros(n, dtype=np.int16)
     return LoopRecord(

@@ -149,7 +149,7 @@ class SampleWatch:
 # --- Stored states of a learner.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
-STATE_SCHEMA: Final = 8
+STATE_SCHEMA: Final = 9
 #: Settings in a learner's state.
 _SETTINGS: Final = re.compile(r"(^|\.)config\.")
 

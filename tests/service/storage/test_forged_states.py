@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.forged_states import DT_S, make_axis, recording
+from benchmarks.forged_states import DT_S, Victims, make_axis, recording
 from dehyst.adaptive.errors import ModelFileError
+from dehyst.adaptive.online.learner import Parts
+from dehyst.adaptive.state import rows
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
@@ -96,6 +98,30 @@ def test_no_state_of_an_axis_with_faulty_samples_is_refused(alone: bool) -> None
                 axis.handle(batch)
         other.restore(through_a_file(axis.state_dict()))
         assert other.handled_seq == axis.handled_seq
+
+
+def test_no_motion_and_no_voltage_beyond_all_measure_is_taken() -> None:
+    """Every entry of the learner in µm or V, or a rate of them, is bounded by the travel and by the drive."""
+    axis = make_axis(alone=True)
+    states = [state for alone, state in Victims().states.values() if alone]
+    seen = set()
+    for row in rows(Parts):
+        if not {"µm", "V"} & {unit.partition("/")[0] for unit in row.unit.split(", ")}:
+            continue
+        name = "learner." + row.name.replace("N.", "0.")
+        state = next((state for state in states if np.size(state.get(name, ()))), None)
+        if state is None:
+            continue  # after a gap or a jump; of the same records as others
+        seen.add(row.name.replace("N.", "0."))
+        for wild in (1e90, -np.inf):
+            forged = wild
+            if isinstance(state[name], np.ndarray):
+                forged = state[name].copy()
+                forged.flat[-1] = wild
+            with pytest.raises(ModelFileError, match=row.name.replace("N.", "0.")):
+                axis.restore(through_a_file(state) | {name: forged})
+    assert {"front.hold.shift_um", "front.trial.window", "front.past0.motion", "filter.beta"} <= seen
+    assert len(seen) > 60
 
 
 @pytest.mark.parametrize(
