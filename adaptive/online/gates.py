@@ -125,7 +125,7 @@ class AdmissionConfig:
 class AdmissionState:
     """What the gates remember of the samples so far."""
 
-    seq: Annotated[int, Entry("number of the last sample taken, -1 before any", low=-1)] = -1
+    seq: Annotated[int, Entry("the last sample taken", low=-1)] = -1
     t_s: Annotated[float, Entry("its time", "s")] = 0.0
     since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
     since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
