@@ -207,7 +207,7 @@ class LssvmInverse(Kinded):
         default_factory=lambda: np.empty((0, 0))
     )
     span_V: Annotated[float, Entry("voltage range of the recording it was identified from", "V")] = 1.0
-    seq: Annotated[int, Entry("number of the last sample that it has seen, -1 for none", low=-1)] = -1
+    seq: Annotated[int, Entry("the last sample that it has seen", low=-1)] = -1
     valid: Annotated[bool, Entry("whether the learner declares it valid")] = True
     anchor: Annotated[FloatArray, Entry("linear part of the identified model, or empty", "V", "p|0")] = field(
         default_factory=lambda: np.empty(0)

@@ -479,7 +479,7 @@ def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Ro
         elif slot.of is bool or slot.of == np.dtype(bool):
             limits = ["a truth value"]
         elif slot.of is str:
-            limits = [", ".join(f"`{word}`" for word in entry.among if word) or "a text"]
+            limits = [", ".join(word for word in entry.among if word) or "a text"]
         shape = (
             ""
             if slot.of in _NUMBERS and slot.kind in ("number", "named")

@@ -68,7 +68,7 @@ class OnlineBaseline(ABC):
 
     base: InverseModel
     config: Any
-    _seq: Annotated[int, Entry("number of the last sample handled, -1 before any", low=-1)]
+    _seq: Annotated[int, Entry("the last sample handled", low=-1)]
     _t_s: Annotated[float, Entry("its time", "s")]
     _since_start: Annotated[int, Entry("samples since the start or a gap", low=0)]
     _square: Annotated[float, Entry("mean square residual", "µm²", low=0.0, name="square_um2")]

@@ -23,17 +23,17 @@ _TABLES: Final[dict[str, type[Any]]] = {
 class LearnerConfig:
     """Frozen configuration of a learner.
 
-    window : samples that the LSSVM holds. learn_every, filter_every : samples between two steps of window and filter;
-    the window learns only what the filter takes, so its number is rounded down to whole steps of the filter.
-    eviction : whose slot a new sample takes: that of its nearest neighbour, or the oldest's ("fifo").
-    cutoff_hz, lag : of the smoother; lag None for what the cut-off needs.
-    serving_age_s : age of the model when its answers take effect, s; errors are judged at that age.
-    valid_enter, valid_leave : rms prediction error, as shares of the voltage span, below which the learner vouches
-    for its model again and above which it no longer does.
-    fallback_floor : share of the voltage span by which the learner may be worse than the model it started from before
-    that one is served in its stead.
-    creep_s : time within which what the constant takes up at rest goes over to the frame, s; 0: it stays (``rest``).
-    before_change : weight of samples of the window from before a detected change of the stage; 1 keeps them all.
+    window : samples that the LSSVM holds.
+    learn_every, filter_every : samples between two steps of window and filter; the former is rounded down to whole
+    steps of the filter.
+    eviction : whose slot a new sample takes: its nearest neighbour's, or the oldest's.
+    cutoff_hz, lag : of the smoother; without lag, what the cut-off needs.
+    serving_age_s : age of the model when its answers take effect; errors are judged at that age.
+    valid_enter, valid_leave : rms prediction error, shares of the voltage span, below which the model is valid again,
+    and above which it no longer is.
+    fallback_floor : share of the voltage span by which the learner may be worse than the identified model.
+    creep_s : time within which what the constant takes up at rest goes over to the frame; 0: it stays.
+    before_change : weight of samples of the window from before a detected change of the stage.
     envelope : what the stage can become.
     """
 

@@ -146,18 +146,18 @@ class DriftConfig:
 
     All but ``gain_*``, ``alike_s``, ``burst_ratio`` and ``gate_*`` are shares of the model's voltage span.
 
-    gain_walk : relative change of the whole linear part. offset_walk : change of the constant.
-    motion_walk : change of the velocity and acceleration coefficients, at full scale of the feature map.
-    shape_walk : change of all other coefficients.
-    noise : least standard deviation of one measurement; larger than the sensor's, since model errors are correlated in
-    time. alike_s : time within which they are alike, s: the variance of one measurement is the long-term mean square
-    innovation times the measurements within it. A stage whose model is wrong by much is so learnt more slowly, and its
-    measurements are no outliers.
-    burst_gain, burst_offset, burst_motion : standard deviations that are added when a sudden change is detected.
-    burst_ratio : detection threshold: short-term over long-term mean square innovation.
-    burst_floor : an rms innovation below this is never a change.
-    gate_sigma : an innovation beyond this many standard deviations is refused ...
-    gate_persistence : ... but after this many refusals in a row the next one is used.
+    gain_walk : relative change of the whole linear part, deviation after one second.
+    offset_walk, motion_walk, shape_walk : the same, shares of the voltage span: of the constant; of velocity and
+    acceleration, at full scale; of all other coefficients.
+    noise : least deviation of one measurement, share of the voltage span; more than the sensor's, since model errors
+    are correlated in time.
+    alike_s : time within which they are alike: the variance of one measurement is the long-term mean square innovation
+    times the measurements within it, so that a stage whose model is far off is learnt more slowly.
+    burst_gain, burst_offset, burst_motion : deviations that a sudden change adds.
+    burst_ratio : short-term over long-term mean square innovation at which a change is detected.
+    burst_floor : an rms innovation below this share of the voltage span is never a change.
+    gate_sigma : an innovation beyond this many deviations is refused.
+    gate_persistence : after this many refusals in a row the next one is used.
     """
 
     gain_walk: float = 0.005

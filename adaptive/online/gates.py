@@ -69,18 +69,20 @@ REASONS = (
 class AdmissionConfig:
     """Limits of the gates.
 
-    u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one is not learnt.
-    y_min_um, y_max_um : range of the sensor; a reading outside is out of range.
-    surprise_share, surprise_sigma : a reading this far from the smoother's prediction, as a share of the model's range
-    at sample times of up to 1 ms (``at``), and this many times the usual error of the prediction, is held back until
-    others tell what it is. glitch_share : a reading this far off is, however wrong the predictions usually are.
-    glitch_persistence : a jump is believed after more readings than that at the new level, ...
-    doubt_persistence : ... or than that where the sensor was wrong within ``doubt_s``, and for jumps outside
-    ``glitch_share`` to ``jump_share`` of the range.
+    u_min_V, u_max_V : the amplifier's rails (default: the limits of the axis).
+    rail_margin_V : a voltage within this of a rail is not learnt.
+    y_min_um, y_max_um : range of the sensor.
+    surprise_share, surprise_sigma : a reading this far from its prediction, as a share of the model's range at sample
+    times of up to 1 ms, and this many times the usual error, is held until the next ones explain it.
+    glitch_share : a reading this far off is always held.
+    jump_share : largest jump, share of the range, believed after glitch_persistence readings.
+    glitch_persistence : a jump is believed after more readings at the new level than this.
+    doubt_persistence : the same where the sensor was wrong within doubt_s, and beyond glitch_share to jump_share.
+    doubt_s : see doubt_persistence.
     max_gap : most missing samples that are bridged; after more, the smoother restarts.
-    settle : samples after a (re)start that are not learnt.
+    settle : samples after a start that are not learnt.
     timing_tolerance : relative error of the time step between two samples.
-    rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
+    rest_share, rest_s : a stage that has stayed within this share of the range for this long is at rest.
     """
 
     u_min_V: float = -ABSURD
@@ -125,7 +127,7 @@ class AdmissionConfig:
 class AdmissionState:
     """What the gates remember of the samples so far."""
 
-    seq: Annotated[int, Entry("number of the last sample taken, -1 before any", low=-1)] = -1
+    seq: Annotated[int, Entry("the last sample taken", low=-1)] = -1
     t_s: Annotated[float, Entry("its time", "s")] = 0.0
     since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
     since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
@@ -267,15 +269,13 @@ def at_rest(
 class EnvelopeConfig:
     """Bounds about the identified model.
 
-    gain : largest factor of change of the stage's or the sensor's gain, up or down. The gain of a piezo stage changes
-    by a few percent with temperature and age, by 20 to 30 % with amplitude and load.
+    gain : largest factor of change of the stage's or the sensor's gain, up or down. That of a piezo stage changes by a
+    few percent with temperature and age, by 20 to 30 % with amplitude and load.
     offset : share of the range by which the zero may move.
-    shape : share of the voltage span by which the linear part and the kernel together may leave the identified linear
-    part, at every point.
-    jump : largest jump, as a share of the range, that is accepted from some readings at one level. A larger change is
-    accepted only after motion has confirmed it.
-    drift_per_s : largest share of the range, a second, by which readings may drift away from the voltage.
-    follow_s : time of motion over which readings must follow the drive before they are trusted again, s.
+    shape : share of the voltage span by which the model may leave the identified linear part, at every point.
+    jump : largest jump, share of the range, accepted from some readings; a larger one needs motion to confirm it.
+    drift_per_s : largest drift of the readings away from the voltage, share of the range a second.
+    follow_s : time of motion for which readings must follow the drive before they are trusted again.
     """
 
     gain: float = 1.35

@@ -199,13 +199,13 @@ class Hold:
     ] = field(default_factory=list)
     slope: Annotated[float, Entry("jumps accepted so far: the expected reading is slope old + shift")] = 1.0
     shift_um: Annotated[float, Entry("the shift of them", "µm", finite=False)] = 0.0
-    jumped: Annotated[int, Entry("number of samples at the last of these jumps, 0 for none", low=0)] = 0
-    silent: Annotated[int, Entry("number of samples at the last one without a reading", low=0)] = 0
+    jumped: Annotated[int, Entry("samples at the last of these jumps, 0 for none", low=0)] = 0
+    silent: Annotated[int, Entry("samples at the last one without a reading", low=0)] = 0
     level: Annotated[int, Entry("index of the first reading of the level that `judge` has found", low=0)] = 0
     away_um: Annotated[float, Entry("distance of that level", "µm", finite=False)] = 0.0
     seen_um: Annotated[float, Entry("largest distance from the expected reading", "µm", finite=False)] = 0.0
     good: Annotated[int, Entry("readings in a row at the expected level", low=0)] = 0
-    rang: Annotated[int, Entry("number of samples at the last ringing about that level, 0 for never", low=0)] = 0
+    rang: Annotated[int, Entry("samples at the last ringing about that level, 0 for never", low=0)] = 0
 
     def put(self, u_V: float, y_um: float) -> None:
         """Append one sample, and advance dead reckoning."""

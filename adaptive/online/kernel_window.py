@@ -43,7 +43,7 @@ class Turn:
 
     clock: Annotated[int, Entry("steps so far", low=0)] = 0
     changed: Annotated[int, Entry("samples up to this step are from before the last change", low=0)] = 0
-    next: Annotated[int, Entry("slots from this on may hold some, -1 for none", low=NOWHERE)] = NOWHERE
+    next: Annotated[int, Entry("slots from this on may hold some", low=NOWHERE)] = NOWHERE
 
 
 #: Time over which the share of the kernel part is taken, s: a stroke of a usual motion.

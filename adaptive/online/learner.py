@@ -66,8 +66,8 @@ class Judgement:
     frozen_V2: Annotated[float, Entry("mean square error of the identified model over long time", "V²", low=0.0)]
     frozen_short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
     error_V: Annotated[float, Entry("the learner's last error", "V")] = 0.0
-    judged: Annotated[int, Entry("number of errors", low=0)] = 0
-    inside: Annotated[int, Entry("number of errors within one stated standard deviation", low=0)] = 0
+    judged: Annotated[int, Entry("errors", low=0)] = 0
+    inside: Annotated[int, Entry("errors within one stated standard deviation", low=0)] = 0
     valid: Annotated[bool, Entry("whether the learnt model is valid")] = True
     fallback: Annotated[bool, Entry("whether the identified model is served because it predicts better")] = False
     fallen_s: Annotated[float, Entry("for how long", "s", low=0.0)] = 0.0

@@ -83,9 +83,9 @@ class Following:
 
     u_V: Annotated[float, Entry("applied voltage at the end of the last step", "V", finite=False)] = math.nan
     p_V: Annotated[float, Entry("the model's voltage for the reading there", "V", finite=False)] = math.nan
-    steps: Annotated[int, Entry("number of pairs since then", low=0)] = 0
-    count: Annotated[float, Entry("number of steps, with forgetting", low=0.0)] = 0.0
-    driven: Annotated[float, Entry("number of steps in which the voltage moved, with forgetting", low=0.0)] = 0.0
+    steps: Annotated[int, Entry("pairs since then", low=0)] = 0
+    count: Annotated[float, Entry("steps, with forgetting", low=0.0)] = 0.0
+    driven: Annotated[float, Entry("steps in which the voltage moved, with forgetting", low=0.0)] = 0.0
     uu: Annotated[float, Entry("sum of u² over the steps, with forgetting", low=0.0)] = 0.0
     pp: Annotated[float, Entry("sum of p² over the steps, with forgetting", low=0.0)] = 0.0
     up: Annotated[float, Entry("sum of u p over the steps, with forgetting")] = 0.0

@@ -112,7 +112,7 @@ class Track:
     memory: Annotated[FloatArray, Entry("hysteresis memory in the learner's frame", "µm", "m")]
     frozen_memory: Annotated[FloatArray, Entry("hysteresis memory in the identified frame", "µm", "m")]
     motion: Annotated[
-        Motion | None, Entry("last smoothed motion, ``lag`` samples old, if any", "µm, µm/s, µm/s²", "3|0")
+        Motion | None, Entry("last smoothed motion, lag samples old, if any", "µm, µm/s, µm/s²", "3|0")
     ] = None
     smooth_V: Annotated[float, Entry("smoothed voltage of that motion", "V")] = 0.0
     rates: Annotated[tuple[float, float], Entry("its rates", "V/s, V/s²", "2")] = (0.0, 0.0)

@@ -13,12 +13,16 @@ class RetuneConfig:
 
     Attributes
     ----------
-    starts : number of descents on a part of the samples; the first begins at the present values. rows : its size.
-    iterations : of each descent, at most. least : fewest samples to tune on.
-    gamma_reach, width_reach : largest factors from the present values; gamma_range, width_range : absolute limits.
-    gain : share by which the rms error on fresh samples must fall. sigmas : by how many of its own standard
-    deviations the mean difference of the errors' sizes must lie above zero. looks : number of comparisons, each with
-    twice the samples. Three looks with 2.29 have the false-positive rate of one with 2 (Pocock 1977).
+    starts : descents on a part of the samples; the first begins at the present values.
+    rows : size of that part.
+    iterations : most of each descent.
+    least : fewest samples to tune on.
+    gamma_reach, width_reach : largest factors from the present values.
+    gamma_range, width_range : absolute limits.
+    gain : share by which the rms error on fresh samples must fall.
+    sigmas : of its own deviations by which the mean difference of the errors' sizes must lie above zero.
+    looks : comparisons, each with twice the samples. Three with 2.29 have the false-positive rate of one with 2
+    (Pocock 1977).
     """
 
     starts: int = 8

@@ -29,7 +29,13 @@ Form = Literal["inverse", "cholesky", "auto"]
 
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
-    """How the window is solved: ``form`` and ``accuracy`` as of `WindowConfig`. Raises InputError on other values."""
+    """How the window is solved, as `WindowConfig` explains.
+
+    form : "inverse" is the fastest, "cholesky" the most exact; "auto" takes what accuracy requires.
+    accuracy : relative error of the solution to be kept.
+
+    Raises InputError on other values.
+    """
 
     form: Form = "auto"
     accuracy: float = 1e-8

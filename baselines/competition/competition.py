@@ -297,7 +297,7 @@ class Competition:
     Raises InputError where the first contestant is no learner or the range is not positive.
     """
 
-    _seq: Annotated[int, Entry("number of the last sample, -1 before any", low=-1)]
+    _seq: Annotated[int, Entry("the last sample", low=-1)]
     _frozen: Annotated[bool, Entry("whether learning is stopped")]
     _choice: Annotated[ChampionChoice, Entry("the choice of a champion", name="")]
     _out: Annotated[list[bool], Entry("which contestants have failed", "", "contestants")]
@@ -305,7 +305,7 @@ class Competition:
         list[tuple[float, float, float, float, float]],
         Entry("motion since the last block, its voltage, and whether it is scored", "µm, µm/s, µm/s², V", "*,5"),
     ]
-    _last: Annotated[int, Entry("number of the last smoothed instant, -1 for none", low=-1)]
+    _last: Annotated[int, Entry("the last smoothed instant", low=-1)]
 
     def __init__(
         self, contestants: dict[str, OnlineModel], span_V: float, config: CompetitionConfig | None = None

@@ -15,13 +15,13 @@ class CompetitionConfig:
     Attributes
     ----------
     block : samples between two judgements.
-    serving_age_s : age of the snapshots that are scored, s; that of the models in the hands of callers.
-    horizon_s : time constant of the mean square error, s of scored motion.
-    margin : factor by which the champion's rms error must exceed that of a challenger.
-    floor : difference of the two errors beyond that, as a share of the voltage span.
-    patience_s : time for which both must hold before the challenger replaces the champion, s of scored motion. The
-        favourite returns at once, without margin and floor.
-    blend_s : duration of a change of champion in a caller's stream of points, s.
+    serving_age_s : age of the snapshots that are scored: that of the models that callers have.
+    horizon_s : time constant of the mean square error, of scored motion.
+    margin : factor by which the champion's rms error must exceed a challenger's.
+    floor : difference of the two errors beyond that, share of the voltage span.
+    patience_s : scored motion for which both must hold before the challenger replaces the champion. The favourite
+        returns at once, without margin and floor.
+    blend_s : duration of a change of champion in a caller's stream of points.
 
     Raises InputError on a value out of range.
     """

@@ -42,7 +42,7 @@ class MemoryTracker:
         list[tuple[float, float, float, float]], Entry("motion and voltage that wait", "µm, µm/s, µm/s², V", "*,4")
     ]
     _begun: Annotated[bool, Entry("whether a sample has come")]
-    _seq: Annotated[int, Entry("number of the last sample, -1 for none", low=-1)]
+    _seq: Annotated[int, Entry("the last sample", low=-1)]
     _y: Annotated[float, Entry("its displacement", "µm", finite=False)]
     _v: Annotated[float, Entry("its velocity", "µm/s", finite=False)]
 

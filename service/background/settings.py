@@ -14,17 +14,18 @@ class WatchConfig:
 
     Attributes
     ----------
-    enabled : False switches the diagnosis off: no samples are kept, no process is started.
-    history_s : length of the samples kept, s; those before the recent ones settle the hysteresis memory.
-    reference_s : length of the reference, s; it is taken after the start and after each verdict.
-    recent_s : length of the samples diagnosed on request, s.
-    collect_s : length of the samples collected after an alarm and then diagnosed, s.
-    gain_alarm : relative change of the stage's gain since the reference that raises an alarm.
-    offset_alarm : change of the stage's offset since the reference that raises an alarm, share of the voltage span.
-    error_factor, error_floor_pct : an alarm is raised when the recent rms error of the learner exceeds this multiple of
-        that in the reference, and this percentage of the voltage span.
-    hold_s : time for which a condition must last to raise an alarm, s. cooldown_s : least time between two alarms, s.
-    timeout_s : longest time of a diagnosis, s; then its process is killed.
+    enabled : false: no samples are kept, no process is started.
+    history_s : time of the samples kept; those before the recent ones settle the hysteresis memory.
+    reference_s : time of the reference, which is taken after the start and after each verdict.
+    recent_s : time of the samples diagnosed on request.
+    collect_s : time of the samples collected after an alarm and then diagnosed.
+    gain_alarm : relative change of the gain since the reference that raises an alarm.
+    offset_alarm : the same of the offset, share of the voltage span.
+    error_factor, error_floor_pct : an alarm is raised when the learner's recent rms error exceeds this multiple of that
+        in the reference, and this percentage of the voltage span.
+    hold_s : time for which a condition must last to raise an alarm.
+    cooldown_s : least time between two alarms.
+    timeout_s : longest time of a diagnosis; then its process is killed.
     reports : folder for full reports on request (``"report": true``); empty for none.
     """
 
@@ -73,12 +74,12 @@ class RetuningConfig:
 
     Attributes
     ----------
-    enabled : False switches re-tuning off, also on request.
-    period_s : time from the end of a re-tuning to the next, s of samples; 0: only on request.
-    fresh : samples of the window that a proposal is tried on; it was not tuned on them.
-    wait_s : longest wait for the fresh samples, s of samples; then the proposal is dropped.
-    lead_s : time between announcement and adoption, s of samples, so that a standby adopts at the same sample.
-    timeout_s : longest time of the process, s.
+    enabled : false: no re-tuning, also on request.
+    period_s : time of samples from the end of a re-tuning to the next; 0: only on request.
+    fresh : new samples of the window that a proposal is tried on.
+    wait_s : longest time of samples to wait for these; then the proposal is dropped.
+    lead_s : time of samples from announcement to adoption, so that a standby adopts at the same one.
+    timeout_s : longest time of the process.
     search : range of the search and the criterion of a better model; see ``adaptive.tuning.config``.
     """
 

@@ -40,7 +40,7 @@ class RepetitionConfig:
     share: Annotated[
         float,
         Setting(
-            help="largest correction, and largest residual that is no doubt, as a share of the voltage range",
+            help="largest correction, and largest residual not in doubt, as a share of the voltage range",
             low=0,
             above=True,
             high=1,

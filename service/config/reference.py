@@ -23,7 +23,9 @@ from dehyst.service.config.schema import Key, inline_keys, keys_of
 from dehyst.service.config.settings import AxisConfig, ServeConfig
 from dehyst.service.fleet.settings import FleetSettings
 
-_HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
+_HEAD = """\
+# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s. Paths are relative to it.
+"""
 _WIDTH = 36
 #: Nested dataclasses that have a table of their own on the page.
 _OWN_TABLES = (CompetitionConfig, CorrectionConfig, RepetitionConfig, RetuningConfig, WatchConfig)
@@ -31,8 +33,10 @@ _TITLE = """\
 # Configuration of `dehyst serve`
 
 One TOML file. `dehyst serve --example` prints one with every key of the first two tables. A key that is not listed here
-is an error. Relative paths are relative to the folder of the file. This page is generated from the schema:
-`python -m dehyst.service.config.reference > docs/configuration.md`.
+is an error. Paths are relative to the file; units are part of names. What the tables are for: [learner, competition,
+re-tuning](learner.md), [correction, repetition](correction.md), [diagnosis](diagnosis.md), [fleet](fleet.md).
+
+Generated from the schema: `python -m dehyst.service.config.reference > docs/configuration.md`.
 """
 
 
@@ -52,7 +56,7 @@ def tables() -> tuple[tuple[str, type], ...]:
     return (
         ("The file", ServeConfig),
         ("`[[axis]]`: one table for each axis", AxisConfig),
-        ("`[axis.learner]`: the model that learns", LearnerConfig),
+        ("`[axis.learner]`, `[fleet.learner]`: the model that learns", LearnerConfig),
         ("`[axis.competition]`: comparison and exchange of models", CompetitionConfig),
         ("`[axis.retuning]`: background tuning of hyper-parameters", RetuningConfig),
         ("`[axis.correction]`: correction by fresh readings", CorrectionConfig),
@@ -85,20 +89,20 @@ def _example_of(kind: type) -> list[str]:
 def _rows(kind: type, prefix: str) -> list[str]:
     """The rows of one table; nested tables follow with dotted names."""
     described = _described(kind)
-    head = ["| key | default | values | meaning |", "|---|---|---|---|"] if not prefix else []
+    head = ["| key | default, range | meaning |", "|---|---|---|"] if not prefix else []
     rows, nested = list[tuple[str, ...]](), list[str]()
     for key in _flat(kind):
-        if isinstance(key.type, type) and is_dataclass(key.type) and key.type not in _OWN_TABLES:
-            nested += _rows(key.type, f"{prefix}{key.name}.")
-        else:
+        if not _is_table(key):
             meaning = key.setting.help or described.get(key.name, "")
-            rows.append((f"`{prefix}{key.name}`", _default(key), _values(key), meaning))
+            rows.append((f"`{prefix}{key.name}`", _values(key), meaning))
+        elif isinstance(key.type, type) and key.type not in _OWN_TABLES:
+            nested += _rows(key.type, f"{prefix}{key.name}.")
     return [*head, *_lines(rows), *nested, *([] if prefix else [""])]
 
 
 def _lines(rows: list[tuple[str, ...]]) -> Iterator[str]:
     """The rows as lines; neighbours that are described together are one."""
-    for _, group in groupby(rows, key=lambda row: row[3] or row[0]):
+    for _, group in groupby(rows, key=lambda row: row[-1] or row[0]):
         columns = list(zip(*group, strict=True))
         same = [column[:1] if len(set(column)) == 1 else column for column in columns]
         cells = [", ".join(cell or "none" for cell in column) if len(column) > 1 else column[0] for column in same]
@@ -123,30 +127,16 @@ def _toml(key: Key) -> str:
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
-def _default(key: Key) -> str:
-    if key.required:
-        return "none: must be given"
-    if get_origin(key.type) is dict or is_dataclass(key.type):
-        return "see below"
-    return f"`{_toml(key)}`" if _plain(key.default) else ""
-
-
 def _values(key: Key) -> str:
+    """The default and the range of a key; its type where no default shows it."""
+    kind = get_args(key.type)[0] if isinstance(key.type, UnionType) else key.type
+    names = {str: "text", Path: "path", float: "number", int: "integer", tuple: "list"}
     bounds = key.setting.range()
-    if bounds:
-        return bounds
-    kinds = (
-        [one for one in get_args(key.type) if one is not type(None)] if isinstance(key.type, UnionType) else [key.type]
-    )
-    kind = kinds[0]
     if get_origin(kind) is Literal:
-        return ", ".join(f"`{json.dumps(choice)}`" for choice in get_args(kind))
-    if get_origin(kind) is tuple:
-        return "tables" if is_dataclass(get_args(kind)[0]) else "list"
-    if get_origin(kind) is dict or is_dataclass(kind):
-        return "table"
-    names = {str: "text", Path: "path", float: "number", int: "integer", bool: "`true`, `false`"}
-    return f"{names[kind]}{', ' + key.setting.unit if key.setting.unit else ''}"
+        bounds = " ".join(f"`{json.dumps(choice)}`" for choice in get_args(kind))
+    if _plain(key.default):
+        return f"`{_toml(key)}`{bounds and f'; {bounds}'}"
+    return f"{'required; ' if key.required else ''}{bounds or names.get(get_origin(kind) or kind, 'table')}"
 
 
 def _described(kind: type) -> dict[str, str]:

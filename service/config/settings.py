@@ -44,7 +44,7 @@ class AxisConfig:
     model: Annotated[
         Path,
         Setting(
-            help="model file from 'dehyst identify'; relative to this file",
+            help="model file from 'dehyst identify'",
             example="x.npz",
             shown=True,
             advice="make one with 'dehyst identify'",
@@ -75,9 +75,7 @@ class AxisConfig:
         float,
         Setting(help="highest rate at which changes of the model are published; 0: none", unit="1/s", low=0, high=1000),
     ] = 200.0
-    recorder: Annotated[
-        Path | None, Setting(help="folder for recordings; relative to this file", example="recordings/x")
-    ] = None
+    recorder: Annotated[Path | None, Setting(help="folder for recordings", example="recordings/x")] = None
     recorder_bytes: Annotated[
         int,
         Setting(help="most disk that recordings take; the oldest go first", unit="bytes", low=1_000_000, high=10**15),
@@ -85,7 +83,7 @@ class AxisConfig:
     checkpoints: Annotated[
         Path | None,
         Setting(
-            help="folder for the learner's state, which a restart continues; relative to this file",
+            help="folder for the learner's state, which a restart continues",
             example="checkpoints/x",
         ),
     ] = None
@@ -114,7 +112,7 @@ class AxisConfig:
     last_good_s: Annotated[
         float,
         Setting(
-            help="age at which a model that is no longer renewed gives way to the baseline",
+            help="age at which a model that is not renewed gives way to the baseline",
             unit="s",
             low=0,
             above=True,
@@ -161,8 +159,7 @@ class ServeConfig:
     key: Annotated[
         Path | None,
         Setting(
-            help="file with the key that service, standby, clients and stage share; default: that of this user on this "
-            "machine, which the first start makes (docs/access.md)",
+            help="file with the shared key; default: this user's, which the first start makes (docs/access.md)",
             example="dehyst.key",
         ),
     ] = None
@@ -172,7 +169,7 @@ class ServeConfig:
     busy_after_s: Annotated[
         float,
         Setting(
-            help="a query for more than 128 points that would take longer than this beside others is refused as busy",
+            help="a query for more than 128 points that would take longer than this is refused as busy",
             unit="s",
             low=0.01,
             high=60,
@@ -182,7 +179,7 @@ class ServeConfig:
         float, Setting(help="silence after which a service counts as dead", unit="s", low=0.1, high=60)
     ] = 1.0
     insecure_beyond_loopback: Annotated[
-        bool, Setting(help="true: everybody who reaches an address on another machine may do everything")
+        bool, Setting(help="true: whoever reaches an address on another machine may do everything")
     ] = False
 
 

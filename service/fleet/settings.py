@@ -23,7 +23,7 @@ class FleetSettings:
     axes: Annotated[int, Setting(help="number of axes", low=1, high=MOST_AXES, shown=True)]
     models: Annotated[
         tuple[Path, ...],
-        Setting(help="model files from 'dehyst identify': one for all axes, or one for each; relative to this file"),
+        Setting(help="model files from 'dehyst identify': one for all axes, or one for each"),
     ]
     limits: Annotated[
         Limits,
@@ -50,7 +50,7 @@ class FleetSettings:
     ] = 5.0
     checkpoints: Annotated[
         Path | None,
-        Setting(help="folder for one checkpoint of each axis; relative to this file", example="checkpoints/fleet"),
+        Setting(help="folder for one checkpoint of each axis", example="checkpoints/fleet"),
     ] = None
     checkpoint_s: Annotated[
         float, Setting(help="time in which each axis is written once", unit="s", low=0.05, high=86400)

@@ -59,7 +59,7 @@ class SequenceTracker:
     skipped because this process left their samples out (see `leave_out`), which are none of ``lost``.
     """
 
-    last: Annotated[int, Entry("highest number in order in the stage's present count, -1 before any", low=-1)]
+    last: Annotated[int, Entry("highest number in order in the stage's present count", low=-1)]
     received: Annotated[int, Entry("samples received", low=0)]
     lost: Annotated[int, Entry("numbers that never arrived", low=0)]
     late: Annotated[int, Entry("samples doubled, out of order, or far ahead without confirmation", low=0)]

@@ -169,7 +169,7 @@ _RECENT: Final = 1024
 class ServedEntries:
     """What is served, beside models and memories."""
 
-    seq: Annotated[int, Entry("the last sample handled before the snapshot, -1 before any", low=-1)]
+    seq: Annotated[int, Entry("the last sample handled before the snapshot", low=-1)]
     t_s: Annotated[float, Entry("its time", "s")]
     u_V: Annotated[float, Entry("its voltage", "V", finite=False)]
     default: Annotated[str, Entry("name of the model that answers where a query names none", most=1000)]
@@ -182,7 +182,7 @@ class ServedEntries:
 class AxisEntries:
     """What an axis holds beside the learner and its supervisor, numbers and clock of samples, and frozen models."""
 
-    seq: Annotated[int, Entry("number of the last sample handled, -1 before any", low=-1)]
+    seq: Annotated[int, Entry("the last sample handled", low=-1)]
     served: Annotated[ServedEntries, Entry("what is served")]
     gates: Annotated[dict[str, int], Entry("samples by outcome", low=0)]
     memory: Annotated[dict[str, FloatArray], Entry("hysteresis memory of each served model")]

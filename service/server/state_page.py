@@ -33,9 +33,9 @@ All that changes in an axis, as a checkpoint stores it and as a standby receives
 does not fit is refused; the message names the entry, what was got and what was expected. The axis then starts from an
 older checkpoint or from its model file.
 
-*Value* is shape, unit and range. p: inputs of the linear part, d: of the kernel, m: doubles of the hysteresis memory,
-N: samples of the window; any other name, and `*`, is a length of that entry. NaN: may be not finite. An entry is listed
-once, in the first table that has it. The entries of a stored model are those of its
+In brackets are shape, unit and range. p: inputs of the linear part, d: of the kernel, m: doubles of the hysteresis
+memory, N: samples of the window; any other name, and `*`, is a length of that entry. -1: none yet. NaN: may be not
+finite. An entry is listed once, where it comes first. The entries of a stored model are those of its
 [payload](protocol.md#evaluating-a-model).
 """
 #: Title of each table, where its entries are, and who declares them.
@@ -60,17 +60,18 @@ _MODELS: Final = (LssvmInverse, FeatureMap)
 
 def page() -> str:
     """The page in Markdown."""
-    lines, listed = [_TITLE], dict[tuple[tuple[str, ...], ...], str]()
-    told = set[str]()
+    parts, listed = [_TITLE], dict[tuple[tuple[str, ...], ...], str]()
+    told = set[tuple[str, str]]()
     for title, where, cls in _TABLES:
-        new = [line for line in _cells(list(rows(cls, where, _MODELS)), listed) if line not in told]
+        new = [entry for entry in _entries(list(rows(cls, where, _MODELS)), listed) if entry not in told]
         told.update(new)
-        lines += [f"## {title}", "", "| entry | value | meaning |", "|---|---|---|", *new, ""]
-    return "\n".join(lines)
+        width = max(len(name) for name, _ in new)
+        parts += [f"## {title}", "", "```text", *(f"{name:<{width}}  {meaning}" for name, meaning in new), "```", ""]
+    return "\n".join(parts)
 
 
-def _cells(found: list[Row], listed: dict[tuple[tuple[str, ...], ...], str]) -> Iterator[str]:
-    """The lines of a table. The entries of a record are listed once; ``listed`` holds where."""
+def _entries(found: list[Row], listed: dict[tuple[tuple[str, ...], ...], str]) -> Iterator[tuple[str, str]]:
+    """Name and meaning of each entry. The entries of a record are listed once; ``listed`` holds where."""
     skipped = "-"
     for i, row in enumerate(found):
         if row.name.startswith(skipped):
@@ -81,9 +82,9 @@ def _cells(found: list[Row], listed: dict[tuple[tuple[str, ...], ...], str]) -> 
             record = tuple((r.name.removeprefix(row.name), r.shape, r.unit, r.range, r.meaning) for r in inner)
             first = listed.setdefault(record, row.name)
             if len(record) > 2 and first != row.name:
-                skipped, meaning = row.name, f"{meaning}; entries as in `{first}`"
+                skipped, meaning = row.name, f"{meaning}; entries as in {first}"
         value = ", ".join(filter(None, (row.shape and f"({row.shape})", row.unit, _short(row.range))))
-        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in (f"`{row.name}`", value, meaning)) + " |"
+        yield row.name, f"{meaning} [{value}]" if value else meaning
 
 
 def _short(limits: str) -> str:

@@ -57,7 +57,7 @@ class CheckpointMeta:
     stage: Annotated[str, Entry("stage on the wire")]
     axis: Annotated[str, Entry("axis on the wire")]
     dt_s: Annotated[float, Entry("sample time", "s", low=5e-324)]
-    seq: Annotated[int, Entry("number of the last sample handled")]
+    seq: Annotated[int, Entry("the last sample handled")]
     samples: Annotated[int, Entry("count of all samples handled")]
     time_unix_s: Annotated[float, Entry("time of writing, to be shown and for operations in the journal", "s")] = 0.0
     instance: Annotated[str, Entry("the instance that wrote it")] = ""

@@ -22,5 +22,5 @@ def test_every_entry_of_an_axis_that_learns_is_on_the_page() -> None:
     for name in axis.state_dict():
         if not name.startswith(apart) and ".features." not in name and ".served." not in name:
             group = name.rpartition(".")[0]
-            named = f"`{name}`" in told or f"`{group}.NAME`" in told or name.rpartition(".")[2] in told
+            named = f"\n{name} " in told or f"\n{group}.NAME " in told or name.rpartition(".")[2] in told
             assert named, name
