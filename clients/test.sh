@@ -34,6 +34,9 @@ echo "test-clients: C, static and shared library"
 "$compiler" $flags c/test_vectors.c -o "$out/test_shared" -L"$built" -ldehyst -lm
 LD_LIBRARY_PATH="$built" "$out/test_shared" ../../docs/protocol/vectors
 # shellcheck disable=SC2086
+"$compiler" $flags c/corrected.c "$built/libdehyst.a" -o "$out/corrected" -lm -lpthread -ldl
+"$out/corrected" ../../docs/protocol/vectors/bouc_wen.model.payload
+# shellcheck disable=SC2086
 "$compiler" $flags c/bench.c "$built/libdehyst.a" -o "$out/bench" -lm -lpthread -ldl
 
 if [ -z "${DEHYST_TEST_ZENOH:-}" ]; then

@@ -288,6 +288,8 @@ class Repetition:
         """Let go, with half the gain, once the residual of the last pass is `_GROWN` times the smallest of a pass."""
         assert self.period is not None
         n = round(self.period)
+        if i < n:
+            return  # a late reading from before the first pass that is kept
         if math.isnan(self._power):
             self._square[i - n : i] = self._r[i - n : i] ** 2
             self._power = self._least = float(self._square[i - n : i].sum())

@@ -28,7 +28,7 @@ from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from dehyst.service.answers.answering import Served, answer, blends, learns
 from dehyst.service.answers.guard import Limits, limit_voltage
 from dehyst.service.client.correcting import Correcting
-from dehyst.service.config.correction import CorrectionConfig
+from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
 from dehyst.service.protocol.delta import checksum, encode_delta
@@ -198,6 +198,7 @@ def snapshots() -> dict[str, Snapshot]:
         Snapshot("bouc_wen", "bouc_wen", BOUC_WEN),
         Snapshot("bouc_wen-zero-order", "bouc_wen", zero_order),
         Snapshot("bouc_wen-flat", "bouc_wen", flat),
+        Snapshot("bouc_wen-troubled", "bouc_wen", BOUC_WEN, trouble="sensor_stuck"),
         Snapshot("mpi", "mpi", MPI),
         Snapshot("pi", "mpi", pi),
         Snapshot("lssvm", LEARNING, small, stand_in=MPI),
@@ -555,47 +556,117 @@ def authenticators() -> list[str]:
     return table
 
 
-#: Settings of the correction of `correction_lines`, as in a status.
+#: Settings of the corrections in the vectors, as in a status.
 CORRECTION: Final = CorrectionConfig(on=True, share=0.004, mode_Hz=200.0, fade_s=0.05)
+REPETITION: Final = RepetitionConfig(on=True, share=0.1, mode_Hz=200.0, fade_s=0.05)
 
 
-def correction_lines() -> list[str]:
-    """What a follower that corrects gives for each point: readings that are late, doubted, missing, or oscillate."""
-    made, correcting = snapshots(), Correcting(CORRECTION, LIMITS, DT_S)
-    now, memory, u_V = made["lssvm"], moved(made["lssvm"].model), math.nan
-    settings = (CORRECTION.share, CORRECTION.mode_Hz, CORRECTION.fade_s)
-    table = [
-        f"# lssvm.model.payload {' '.join(map(repr, settings))}",
-        "# seq y_um v_um_per_s change read_seq read_um u_V correction_V age halved doubted",
-    ]
-    noise_um = 0.003 * (np.arange(1200) * 7919 % 13 - 6) / 6.0
-    y = np.where(np.arange(1200) < 700, 40.0 + 0.01 * np.arange(1200), 47.0)  # a slow way up, and rest
-    v = np.where(np.arange(1200) < 700, 10.0, 0.0)
-    for k in range(1200):
-        change = {400: "lssvm-jumped", 1100: "lssvm-troubled"}.get(k, "")
-        now = made[change] if change else now
-        model = now.model
-        seen, read_um = k - (1 if k < 100 else 3), math.nan
-        if k >= 3 and not 300 <= k < 380:
-            read_um = float(y[seen] - 0.03 + noise_um[k])
-            read_um += 5.0 if k in (60, 61, 250) else 0.0
-            read_um += 0.2 * (1.0 if k % 20 < 10 else -1.0) if 500 <= k < 680 else 0.0
-            correcting.read([seen], [read_um])
-        points = y[k : k + 1], v[k : k + 1], np.zeros(1)
-        got = model.feedforward(*points, memory)
-        answered = got.u_V, float(got.std_V[0])
-        added_V = float(correcting.voltage(k, model, points, memory, answered, now.trouble)[0])
-        step_V = LIMITS.slew_V_per_s * DT_S
-        u_V, flags = limit_voltage(float(got.u_V[0]) + added_V, u_V, LIMITS.u_min_V, LIMITS.u_max_V, step_V)
-        if flags or not got.inside[0]:
-            correcting.leave_out(k, np.ones(1))
-        memory, integral = got.memory, correcting.correction
+@dataclass(frozen=True)
+class Corrected:
+    """What a follower that corrects is asked for and given, sample after sample.
+
+    model : file of the first snapshot. y_um, v_um_per_s : (n,) motion. reading : (sample, its reading, µm) that comes
+    before sample k, or None, from k and the voltages that the samples before it got beyond the model's answers, V.
+    changes : file of a snapshot that comes before a sample. periods : what is stated before a sample, s; None: find it.
+    repetition : settings; None: off.
+    """
+
+    model: str
+    y_um: FloatArray
+    v_um_per_s: FloatArray
+    reading: Callable[[int, list[float]], tuple[int, float] | None]
+    changes: dict[int, str] = field(default_factory=dict)
+    periods: dict[int, float | None] = field(default_factory=dict)
+    repetition: RepetitionConfig | None = None
+
+    def lines(self) -> list[str]:
+        """The table that docs/protocol.md describes."""
+        made, correcting = snapshots(), Correcting(CORRECTION, LIMITS, DT_S, self.repetition)
+        integral, repetition = correcting.correction, correcting.repetition
         assert integral is not None
-        file, reading = f"{change}.model.payload" if change else "-", seen if math.isfinite(read_um) else "-"
-        row = (k, float(y[k]), float(v[k]), file, reading, read_um, u_V)
-        state = (integral.u_V, correcting.age, integral.halved, integral.doubted)
-        table.append(" ".join(map(str, (*row, *state))))
-    return table
+        now, memory, u_V = made[self.model], moved(made[self.model].model), math.nan
+        off = RepetitionConfig(share=math.nan, mode_Hz=math.nan, fade_s=math.nan)
+        each = CORRECTION, self.repetition or off
+        settings = " ".join(f"{one.share!r} {one.mode_Hz!r} {one.fade_s!r}" for one in each)
+        columns = "seq y_um v_um_per_s change period_s read_seq read_um u_V age integral_V halved doubted"
+        table = [f"# {self.model}.model.payload {settings}", f"# {columns} repetition_V halved doubted period active"]
+        added_V: list[float] = []
+        for k, (y_um, v_um_per_s) in enumerate(zip(self.y_um.tolist(), self.v_um_per_s.tolist(), strict=True)):
+            change, period_s, reading = self.changes.get(k), "-", self.reading(k, added_V)
+            now = now if change is None else made[change]
+            if repetition is not None and k in self.periods:
+                stated = self.periods[k]
+                repetition.state(stated)
+                period_s = "nan" if stated is None else repr(stated)
+            if reading is not None:
+                correcting.read(*([value] for value in reading))
+            model, points = now.model, (np.array([y_um]), np.array([v_um_per_s]), np.zeros(1))
+            got = model.feedforward(*points, memory)
+            answered = got.u_V, got.std_V.item()
+            wanted_V = got.u_V + correcting.voltage(k, model, points, memory, answered, now.trouble)
+            step_V = LIMITS.slew_V_per_s * DT_S
+            u_V, flags = limit_voltage(wanted_V.item(), u_V, LIMITS.u_min_V, LIMITS.u_max_V, step_V)
+            correcting.applied(k, np.array([u_V]))
+            if flags or not got.inside[0]:
+                correcting.leave_out(k, np.ones(1))
+            added_V.append(u_V - got.u_V.item())
+            memory, file = got.memory, "-" if change is None else f"{change}.model.payload"
+            row = [k, y_um, v_um_per_s, file, period_s, *(reading or ("-", math.nan)), u_V, correcting.age]
+            row += [integral.u_V, integral.halved, integral.doubted]
+            if repetition is None:
+                row += [0.0, 0, 0, math.nan, 0]
+            else:
+                period = math.nan if repetition.period is None else repetition.period
+                row += [repetition.u_V, repetition.halved, repetition.doubted, period, int(repetition.active)]
+            table.append(" ".join(map(str, row)))
+        return table
+
+
+def corrected_by_integral() -> Corrected:
+    """A slow way up, and rest: readings that are late, doubted, missing, or oscillate; a new model, and a trouble."""
+    k = np.arange(1200)
+    y = np.where(k < 700, 40.0 + 0.01 * k, 47.0)
+    noise_um = 0.003 * (k * 7919 % 13 - 6) / 6.0
+
+    def reading(k: int, added_V: list[float]) -> tuple[int, float] | None:
+        if k < 3 or 300 <= k < 380:
+            return None
+        seen = k - (1 if k < 100 else 3)
+        read_um = float(y[seen] - 0.03 + noise_um[k])
+        read_um += 5.0 if k in (60, 61, 250) else 0.0
+        read_um += 0.2 * (1.0 if k % 20 < 10 else -1.0) if 500 <= k < 680 else 0.0
+        return seen, read_um
+
+    changes = {400: "lssvm-jumped", 1100: "lssvm-troubled"}
+    return Corrected("lssvm", y, np.where(k < 700, 10.0, 0.0), reading, changes)
+
+
+def corrected_by_repetition() -> Corrected:
+    """A wave, one of another amplitude, another motion of a period that is stated, and its end.
+
+    The stage follows the voltage two and a half samples later, and is off by a wave of the same period. Readings are
+    doubted, missing, of other ages, and doubted for long; the error grows at once; a trouble comes and goes.
+    """
+    k = np.arange(1720)
+    # Of 40.4 samples and 25.25.
+    first, second = (2.0 * np.pi * k / period for period in (40.4, 25.25))
+    swing_um = np.where(k < 420, 10.0, 12.0)
+    y = np.where(k < 760, 45.0 + swing_um * np.sin(first), 50.0 + 6.0 * np.sin(second) + 2.0 * np.sin(2.0 * second))
+    y = np.round(np.where(k < 1650, y, y[1650]), 3)
+    v = np.round(np.gradient(y) / DT_S, 1)
+    off_um = np.where(k < 760, np.sin(2.0 * first), np.where(k < 1150, 1.0, 8.0) * np.sin(second + 0.7))
+    off_um = np.round(0.06 * off_um + 0.004 * (k * 7919 % 13 - 6) / 6.0, 4)
+
+    def reading(k: int, added_V: list[float]) -> tuple[int, float] | None:
+        seen = k - (4 if 350 <= k < 400 else 1)
+        if seen < 0 or 310 <= k < 330 or k % 97 == 5:
+            return None
+        followed_um = 11.0 * np.mean(added_V[max(seen - 3, 0) : max(seen - 1, 1)])
+        read_um = round(float(y[seen] - off_um[seen] + followed_um), 4)
+        return seen, read_um + (30.0 if k == 290 or 1480 <= k < 1540 else 0.0)
+
+    changes = {600: "bouc_wen-zero-order", 1400: "bouc_wen-troubled", 1405: "bouc_wen"}
+    return Corrected("bouc_wen", y, v, reading, changes, {760: 25.25 * DT_S, 1700: None}, REPETITION)
 
 
 def write(out: Path) -> int:
@@ -643,7 +714,8 @@ def write(out: Path) -> int:
         files[f"refused-{name}.payload"] = payload
         table.append(f"refused-{name}.payload {kind} {at}")
     files["refused.txt"] = ("\n".join(table) + "\n").encode()
-    files["correction.txt"] = ("\n".join(correction_lines()) + "\n").encode()
+    for name, corrected in (("correction", corrected_by_integral()), ("repetition", corrected_by_repetition())):
+        files[f"{name}.txt"] = ("\n".join(corrected.lines()) + "\n").encode()
     files["authenticators.txt"] = ("\n".join(authenticators()) + "\n").encode()
     for name, payload in files.items():
         (out / name).write_bytes(payload)

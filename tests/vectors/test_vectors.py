@@ -376,6 +376,10 @@ def test_the_command_makes_the_same_vectors(tmp_path: Path) -> None:
         if old == new:
             continue
         # The last bits of memories and answers depend on the processor.
+        if made.name in ("correction.txt", "repetition.txt"):
+            for before, now in zip(table(made.name), table(made.name, tmp_path), strict=True):
+                compare_cells(before, now)
+            continue
         assert len(old) == len(new), made.name
         for kind, decode in (
             (".model.", page_client.decode_model),
@@ -388,6 +392,12 @@ def test_the_command_makes_the_same_vectors(tmp_path: Path) -> None:
                 break
         else:
             pytest.fail(f"{made.name}: not the bytes of the command; run python -m tests.vectors.make_vectors")
+
+
+def compare_cells(old: list[str], new: list[str]) -> None:
+    for before, now in zip(old, new, strict=True):
+        if before != now:
+            np.testing.assert_allclose(float(now), float(before), rtol=TOLERANCE, atol=TOLERANCE)
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> None:

@@ -264,40 +264,49 @@ static int authenticators(const char *folder) {
     return checked;
 }
 
-static int corrections(const char *folder, const dehyst_limits *limits) {
-    char path[1024], line[1024], model[80], change[80], read_seq[32];
-    snprintf(path, sizeof path, "%s/correction.txt", folder);
+/* What a follower that corrects gives, point after point; returns the number of points. */
+static int corrections(const char *folder, const char *table, const dehyst_limits *limits) {
+    char path[1024], line[1024], model[80], change[80], read_seq[32], period_s[32];
+    snprintf(path, sizeof path, "%s/%s", folder, table);
     FILE *file = fopen(path, "r");
-    dehyst_correction settings;
+    dehyst_correction integral, repetition;
     CHECK(file && fgets(line, sizeof line, file) &&
-              sscanf(line, "# %79s %lf %lf %lf", model, &settings.share, &settings.mode_Hz, &settings.fade_s) == 4,
-          "correction.txt");
+              sscanf(line, "# %79s %lf %lf %lf %lf %lf %lf", model, &integral.share, &integral.mode_Hz, &integral.fade_s,
+                     &repetition.share, &repetition.mode_Hz, &repetition.fade_s) == 7,
+          "%s", table);
     if (!file)
         return 0;
+    int repeats = !isnan(repetition.share);
     payload first = load(folder, model);
     dehyst *handle = NULL;
     CHECK(dehyst_open_payload(first.bytes, first.length, limits, &handle) == 0, "%s", dehyst_error());
     CHECK(dehyst_corrected(handle, 1, NULL) == -1 && strstr(dehyst_error(), "dehyst_correct"), "no correction yet");
-    dehyst_correction bad = settings;
+    dehyst_correction bad = integral;
     bad.mode_Hz = 0.0;
-    CHECK(dehyst_correct(handle, &bad) == -1 && strstr(dehyst_error(), "mode_Hz"), "a mode of 0 Hz");
-    CHECK(dehyst_correct(handle, &settings) == 0, "%s", dehyst_error());
+    CHECK(dehyst_correct(handle, &bad, NULL) == -1 && strstr(dehyst_error(), "correction.mode_Hz"), "a mode of 0 Hz");
+    CHECK(dehyst_correct(handle, NULL, &bad) == -1 && strstr(dehyst_error(), "repetition.mode_Hz"), "a mode of 0 Hz");
+    CHECK(dehyst_correct(handle, &integral, repeats ? &repetition : NULL) == 0, "%s", dehyst_error());
     CHECK(dehyst_number(handle, -1) == -1 && dehyst_number(NULL, 1) == -1, "a number below 0, no handle");
+    CHECK(dehyst_period(handle, 1e9) == -1 && dehyst_period(NULL, 0.1) == -1, "a period of 1e9 s, no handle");
     int checked = 0;
     while (fgets(line, sizeof line, file)) {
-        double y, v, read_um, u_V, added_V;
+        double y, v, read_um, u_V, integral_V, repetition_V, period;
         long long seq, age;
-        unsigned long long halved, doubted;
+        unsigned long long halved, doubted, halved_too, doubted_too;
+        unsigned active;
         if (line[0] == '#')
             continue;
-        int got = sscanf(line, "%lld %lf %lf %79s %31s %lf %lf %lf %lld %llu %llu", &seq, &y, &v, change, read_seq,
-                         &read_um, &u_V, &added_V, &age, &halved, &doubted);
-        CHECK(got == 11, "correction.txt: %s", line);
+        int got = sscanf(line, "%lld %lf %lf %79s %31s %31s %lf %lf %lld %lf %llu %llu %lf %llu %llu %lf %u", &seq, &y, &v,
+                         change, period_s, read_seq, &read_um, &u_V, &age, &integral_V, &halved, &doubted, &repetition_V,
+                         &halved_too, &doubted_too, &period, &active);
+        CHECK(got == 17, "%s: %s", table, line);
         if (strcmp(change, "-")) {
             payload other = load(folder, change);
             CHECK(dehyst_update(handle, other.bytes, other.length) == 0, "%s", dehyst_error());
             free(other.bytes);
         }
+        if (strcmp(period_s, "-"))
+            CHECK(dehyst_period(handle, atof(period_s)) == 0, "%s", dehyst_error());
         if (strcmp(read_seq, "-")) {
             int64_t number = atoll(read_seq);
             CHECK(dehyst_read(handle, 1, &number, &read_um) == 0, "%s", dehyst_error());
@@ -306,9 +315,14 @@ static int corrections(const char *folder, const dehyst_limits *limits) {
         dehyst_corrected_t state;
         CHECK(dehyst_number(handle, seq) == 0 && dehyst_point(handle, y, v, 0.0, &answer) == 0, "%s", dehyst_error());
         CHECK(dehyst_corrected(handle, 1, &state) == 0, "%s", dehyst_error());
-        same("correction", "u_V", (size_t)seq, answer.u_V, u_V);
-        same("correction", "correction_V", (size_t)seq, state.u_V, added_V);
-        CHECK(state.age == age && state.halved == halved && state.doubted == doubted, "state at %lld", seq);
+        same(table, "u_V", (size_t)seq, answer.u_V, u_V);
+        same(table, "integral_V", (size_t)seq, state.integral.u_V, integral_V);
+        same(table, "repetition_V", (size_t)seq, state.repetition.u_V, repetition_V);
+        same(table, "period", (size_t)seq, state.period, period);
+        CHECK(state.age == age && state.active == active, "%s: state at %lld", table, seq);
+        CHECK(state.integral.halved == halved && state.integral.doubted == doubted, "%s: integral at %lld", table, seq);
+        CHECK(state.repetition.halved == halved_too && state.repetition.doubted == doubted_too,
+              "%s: repetition at %lld", table, seq);
         checked++;
     }
     fclose(file);
@@ -351,7 +365,8 @@ int main(int argc, char **argv) {
     CHECK(steps > 10, "%d steps of changes", steps);
     refusals(argv[1], &rows[0]);
     CHECK(authenticators(argv[1]) >= 6, "authenticators.txt");
-    CHECK(corrections(argv[1], &rows[0].limits) >= 1000, "correction.txt");
+    CHECK(corrections(argv[1], "correction.txt", &rows[0].limits) >= 1000, "correction.txt");
+    CHECK(corrections(argv[1], "repetition.txt", &rows[0].limits) >= 1000, "repetition.txt");
     printf("C: %zu queries, %d followed blocks, %d steps of changes: %d failures\n", count, followed, steps, failures);
     return failures ? 1 : 0;
 }

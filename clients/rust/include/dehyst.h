@@ -80,29 +80,41 @@ int dehyst_advance(dehyst *handle, size_t n, const double *y_um, const double *u
 /* The voltage for the next point of the wanted motion. */
 int dehyst_point(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2, dehyst_answer *answer);
 
-/* Correct the voltages by fresh readings (docs/correction.md); settings as the status of the service has them under
- * "correction". Per sample: dehyst_read what has come, dehyst_number of the next point unless it counts on, then the
- * point. */
+/* Correct the voltages by fresh readings (docs/correction.md): by an integral of the residual, and motion that repeats by
+ * the pass before. Settings as the status of the service has them under "correction" and "repetition"; NULL: not so. Per
+ * sample: dehyst_read what has come, dehyst_number of the next point unless it counts on, then the point. This function
+ * allocates and takes some milliseconds; the others, and a point that they correct, do not allocate. */
 typedef struct {
     double share;    /* largest correction as a share of the voltage range, above 0, up to 1 */
-    double mode_Hz;  /* lowest frequency at which the stage rings, with the heaviest payload */
-    double fade_s;   /* time over which a correction without good readings is let go */
+    double mode_Hz;  /* lowest frequency at which the stage rings, with the heaviest payload, Hz */
+    double fade_s;   /* time over which a correction without good readings is let go, s */
 } dehyst_correction;
-int dehyst_correct(dehyst *handle, const dehyst_correction *settings);
+int dehyst_correct(dehyst *handle, const dehyst_correction *integral, const dehyst_correction *repetition);
+
+/* The motion from the next point on repeats with period_s, 16 to 4096 samples, in s; NAN: find it. What was learnt of the
+ * motion before is let go. */
+int dehyst_period(dehyst *handle, double period_s);
 
 /* The next point is for sample seq (0 to 2^62). Without a number nothing is corrected. */
 int dehyst_number(dehyst *handle, int64_t seq);
 
-/* n readings of samples, rising. Those that were taken before are left out; an error changes nothing. */
+/* n readings of samples, um, rising numbers. Those that were taken before are left out; an error changes nothing. */
 int dehyst_read(dehyst *handle, size_t n, const int64_t *seq, const double *y_um);
 
-/* on 0 lets the correction go, over fade_s. corrected may be NULL. */
+/* One of the two corrections; all 0 where it is off. */
 typedef struct {
-    double u_V;                /* the correction */
-    double factor;             /* share of the designed gain; an oscillation halves it */
-    double noise_um;           /* standard deviation of a reading */
-    int64_t age;               /* samples from a reading to the voltage that it changes */
-    uint64_t halved, doubted;  /* times that the gain was halved, readings that were not used */
+    double u_V;                /* what it adds to the voltage, V */
+    double factor;             /* share of its gain in use; what grows or oscillates halves it */
+    uint64_t halved, doubted;  /* times that its gain was halved, readings that were not used */
+} dehyst_added;
+
+/* on 0 lets the corrections go, over fade_s. corrected may be NULL. */
+typedef struct {
+    dehyst_added integral, repetition;
+    double noise_um;  /* standard deviation of a reading, um; NAN without an integral */
+    double period;    /* of the motion, in samples, stated or found; NAN: none */
+    int64_t age;      /* samples from a reading to the voltage that it changes */
+    uint32_t active;  /* 1: the last point was corrected by the pass before, and the integral stays as it is */
 } dehyst_corrected_t;
 int dehyst_corrected(dehyst *handle, int on, dehyst_corrected_t *corrected);
 

@@ -136,8 +136,8 @@ fn domain_weight(bounds: Option<&[(f64, f64); 3]>, point: [f64; 3], blend_share:
 
 /// Voltages for the points of `motion` from `memory` on, which advances. Neither locks nor allocates.
 ///
-/// `age_s`: age of the newest sample, or None where no newer message is expected. `correct`: from the deviation that is
-/// stated for the first point to what is added to all voltages before the limits, V.
+/// `age_s`: age of the newest sample, or None where no newer message is expected. `correct`: adds to the voltages of the
+/// model, before the limits.
 #[allow(clippy::too_many_arguments)]
 pub fn answer(
     snapshot: &mut Snapshot,
@@ -146,16 +146,13 @@ pub fn answer(
     u_before_v: f64,
     limits: &Limits,
     age_s: Option<f64>,
-    correct: impl FnOnce(f64) -> f64,
+    correct: impl FnOnce(&mut Out),
     out: &mut Out,
 ) -> Done {
     let (trust, stale) = snapshot.trust_by_age(age_s);
     let step_v = limits.slew_v_per_s * snapshot.model.dt_s;
     let done = forward(snapshot, memory, motion, trust, out);
-    let added_v = correct(out.std_v[0]);
-    if added_v != 0.0 {
-        out.u_v.iter_mut().for_each(|u| *u += added_v);
-    }
+    correct(out);
     limit(out, u_before_v, limits, step_v);
     if stale {
         out.flags.iter_mut().for_each(|flags| *flags |= STALE);
@@ -295,7 +292,7 @@ pub fn reply(snapshot: &mut Snapshot, query: &Query, limits: &Limits, age_s: Opt
         (u_v, std_v, flags) = (vec![0.0; n + 1], vec![0.0; n + 1], vec![0; n + 1]);
         let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
         let free = Limits { slew_v_per_s: f64::INFINITY, ..*limits };
-        done = answer(snapshot, &mut memory, &motion, f64::NAN, &free, age_s, |_| 0.0, &mut out);
+        done = answer(snapshot, &mut memory, &motion, f64::NAN, &free, age_s, |_| {}, &mut out);
         let gap = pending.u_v[k - 1] - u_v[0];
         let fade = (0.006 / dt_s).max(6.0);
         u_v.remove(0);
@@ -309,7 +306,7 @@ pub fn reply(snapshot: &mut Snapshot, query: &Query, limits: &Limits, age_s: Opt
     } else {
         (u_v, std_v, flags) = (vec![0.0; n], vec![0.0; n], vec![0; n]);
         let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
-        done = answer(snapshot, &mut memory, &motion, query.u_before_v, limits, age_s, |_| 0.0, &mut out);
+        done = answer(snapshot, &mut memory, &motion, query.u_before_v, limits, age_s, |_| {}, &mut out);
     }
     let stand_in = snapshot.stand_in.as_ref().filter(|_| done.stand_in).map(|other| other.model.name.clone());
     Ok(Reply {

@@ -1,11 +1,13 @@
-//! A guarded integral of the residual on top of the feedforward: docs/correction.md.
+//! Corrections on top of the feedforward by fresh readings: docs/correction.md.
 //!
-//! [`Integral`] is `adaptive/correction/integral.py` of the service, [`Correcting`] pairs readings with what was asked
-//! for, by the numbers of the samples. Neither allocates once it is made.
+//! [`Integral`] is `adaptive/correction/integral.py` of the service, a guarded integral of the residual. [`Correcting`]
+//! pairs readings with what was asked for, by the numbers of the samples, for it and for
+//! [`Repetition`](crate::repetition::Repetition). None of them allocates once it is made.
 
 use crate::answer::Limits;
 use crate::error::{Error, Result};
 use crate::model::{Model, Step};
+use crate::repetition::Repetition;
 use std::collections::VecDeque;
 use std::f64::consts::PI;
 
@@ -86,7 +88,7 @@ impl Oscillation {
     }
 }
 
-/// Settings of a correction, as the status of the service has them under `correction`.
+/// Settings of a correction, as the status of the service has them under `correction` and under `repetition`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CorrectionSettings {
     /// Largest correction as a share of the voltage range, above 0, up to 1.
@@ -97,7 +99,20 @@ pub struct CorrectionSettings {
     pub fade_s: f64,
 }
 
-/// The correction of one axis, V; one `take` for each reading.
+impl CorrectionSettings {
+    fn check(&self, table: &str) -> Result<()> {
+        for (name, value, most) in
+            [("share", self.share, 1.0), ("mode_Hz", self.mode_hz, f64::MAX), ("fade_s", self.fade_s, f64::MAX)]
+        {
+            if !(value > 0.0 && value <= most) {
+                return Err(Error::new(format!("{table}.{name}"), value, format!("a number above 0, up to {most:e}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The integral of one axis, V; one `take` for each reading.
 pub struct Integral {
     /// The correction, V.
     pub u_v: f64,
@@ -257,8 +272,11 @@ const AGE_KEPT: u32 = 1000;
 
 /// What a follower adds to its voltages, and the readings that it waits to use.
 pub struct Correcting {
-    pub integral: Integral,
-    /// False lets the correction go, over `fade_s`.
+    /// None: the axis has none. It stays as it is while the repetition is active.
+    pub integral: Option<Integral>,
+    /// The correction of motion that repeats; None: the axis has none.
+    pub repetition: Option<Repetition>,
+    /// False lets the corrections go, over `fade_s`.
     pub on: bool,
     /// Samples from a reading to the last voltage that it changes; the largest of late.
     pub age: i64,
@@ -266,6 +284,7 @@ pub struct Correcting {
     pub number: i64,
     range_um: f64,
     most_v: f64,
+    dt_s: f64,
     wanted_um: Vec<f64>,
     numbers: Vec<i64>,
     readings: VecDeque<(i64, f64)>,
@@ -277,25 +296,31 @@ pub struct Correcting {
 }
 
 impl Correcting {
-    pub fn new(settings: CorrectionSettings, limits: &Limits, dt_s: f64) -> Result<Correcting> {
-        let CorrectionSettings { share, mode_hz, fade_s } = settings;
-        for (name, value, most) in [("share", share, 1.0), ("mode_Hz", mode_hz, f64::MAX), ("fade_s", fade_s, f64::MAX)]
-        {
-            if !(value > 0.0 && value <= most) {
-                return Err(Error::new(name, value, format!("a number above 0, up to {most:e}")));
-            }
-        }
+    /// `integral` and `repetition`: None where the axis has none. Settings out of their range, and an axis without a
+    /// displacement range, are errors.
+    pub fn new(
+        integral: Option<CorrectionSettings>,
+        repetition: Option<CorrectionSettings>,
+        limits: &Limits,
+        dt_s: f64,
+    ) -> Result<Correcting> {
+        integral.map_or(Ok(()), |settings| settings.check("correction"))?;
+        repetition.map_or(Ok(()), |settings| settings.check("repetition"))?;
         let range_um = limits.y_max_um - limits.y_min_um;
         if !range_um.is_finite() {
             return Err(Error::new("y_min_um, y_max_um", "no limits", "the displacement range of the axis"));
         }
+        let drive_v = limits.u_max_v - limits.u_min_v;
         Ok(Correcting {
-            integral: Integral::new(dt_s, mode_hz, fade_s),
+            integral: integral.map(|settings| Integral::new(dt_s, settings.mode_hz, settings.fade_s)),
+            repetition: repetition
+                .map(|given| Repetition::new(dt_s, given.mode_hz, given.fade_s, given.share * drive_v)),
             on: true,
             age: 0,
             number: -1,
             range_um,
-            most_v: share * (limits.u_max_v - limits.u_min_v),
+            most_v: integral.map_or(0.0, |settings| settings.share * drive_v),
+            dt_s,
             wanted_um: vec![f64::NAN; KEPT],
             numbers: vec![-1; KEPT],
             readings: VecDeque::with_capacity(KEPT),
@@ -325,71 +350,127 @@ impl Correcting {
         Ok(())
     }
 
-    /// Keep what is asked for, and take the slope of `model` at the first point where that is due.
-    pub(crate) fn ask(&mut self, y_um: &[f64], model: &Model, memory: &[f64], spare: &mut [f64], scratch: &mut [f64]) {
+    /// The integral's correction, V; 0 without one.
+    pub(crate) fn integral_v(&self) -> f64 {
+        self.integral.as_ref().map_or(0.0, |integral| integral.u_v)
+    }
+
+    /// Keep what is asked for, and take the slope of `model` at the first point where that is due. `troubled`: the
+    /// service has named a trouble, or the model is stale.
+    pub(crate) fn ask(
+        &mut self,
+        y_um: &[f64],
+        model: &Model,
+        memory: &[f64],
+        spare: &mut [f64],
+        scratch: &mut [f64],
+        troubled: bool,
+    ) {
         for (k, y) in y_um.iter().enumerate() {
             let number = self.number + k as i64;
             let at = number as usize % KEPT;
             (self.numbers[at], self.wanted_um[at]) = (number, *y);
         }
-        if self.readings.is_empty() || !self.on {
-            return;
-        }
-        if self.slope_held == 0 {
-            let mut voltage = |y: f64, v: f64| {
-                spare.copy_from_slice(memory);
-                let mut u_v = f64::NAN;
-                model.evaluate(1, |_| [y, v, 0.0], spare, scratch, |_, step: Step| u_v = step.u_v);
-                u_v
-            };
-            self.local = sensitivity(&mut voltage, y_um[0], self.range_um);
-        }
-        self.slope_held = (self.slope_held + 1) % self.slope_every;
-    }
-
-    /// The correction of the next `n` voltages, V; `std_v`: deviation that the model states, V. `troubled`: the service
-    /// has named a trouble, or the model is stale.
-    pub(crate) fn voltage(&mut self, n: usize, std_v: f64, troubled: bool) -> f64 {
         if troubled || !self.on {
             self.readings.clear();
-            self.integral.release();
-        } else if let Some((first, _)) = self.readings.front() {
+        } else if !self.readings.is_empty() {
+            if self.slope_held == 0 {
+                let mut voltage = |y: f64, v: f64| {
+                    spare.copy_from_slice(memory);
+                    let mut u_v = f64::NAN;
+                    model.evaluate(1, |_| [y, v, 0.0], spare, scratch, |_, step: Step| u_v = step.u_v);
+                    u_v
+                };
+                self.local = sensitivity(&mut voltage, y_um[0], self.range_um);
+            }
+            self.slope_held = (self.slope_held + 1) % self.slope_every;
+        }
+    }
+
+    /// Add the corrections to the model's voltages `u_v`, V, for the next points; `std_v`: deviation that it states for
+    /// the first one, V. `troubled`: as for `ask`.
+    pub(crate) fn correct(&mut self, y_um: &[f64], u_v: &mut [f64], std_v: f64, troubled: bool) {
+        if troubled || !self.on {
+            let mut added_v = 0.0;
+            if let Some(integral) = &mut self.integral {
+                integral.release();
+                added_v += integral.u_v;
+            }
+            if let Some(repetition) = &mut self.repetition {
+                repetition.release();
+                added_v += repetition.u_v;
+            }
+            u_v.iter_mut().for_each(|u| *u += added_v);
+            return;
+        }
+        if let Some((first, _)) = self.readings.front() {
             self.age_held += 1;
-            let age = self.number + n as i64 - 1 - first;
+            let age = self.number + u_v.len() as i64 - 1 - first;
             if age >= self.age || self.age_held >= AGE_KEPT {
                 (self.age, self.age_held) = (age.max(0), 0);
             }
-            self.integral.set(self.age, self.local.0, self.local.1, self.bound_v(std_v));
-            while let Some((number, read_um)) = self.readings.pop_front() {
-                let wanted_um = self.asked(number);
-                let speed = (wanted_um - self.asked(number - 1)) / self.integral.dt_s;
-                self.integral.take(wanted_um - read_um, speed);
-            }
-        } else {
-            self.integral.wait();
+            self.take(std_v);
+        } else if let Some(integral) = &mut self.integral {
+            integral.wait();
         }
-        self.integral.u_v
+        let integral_v = self.integral_v();
+        for (k, (u, y)) in u_v.iter_mut().zip(y_um).enumerate() {
+            // What is no number is replaced by the limits, and has nothing to learn from.
+            let repetition = self.repetition.as_mut().filter(|_| u.is_finite());
+            let repeated_v = repetition.map_or(0.0, |repetition| repetition.add(self.number + k as i64, *y, *u));
+            *u += integral_v + repeated_v;
+        }
     }
 
-    /// Count the points that were answered; readings of those with flags are no residual.
-    pub(crate) fn answered(&mut self, flags: &[u8]) {
-        for (k, _) in flags.iter().enumerate().filter(|(_, flags)| **flags != 0) {
-            self.wanted_um[(self.number + k as i64) as usize % KEPT] = f64::NAN;
+    /// Use the readings that have come.
+    fn take(&mut self, std_v: f64) {
+        let ((slope, lag_s), bound_v) = (self.local, self.bound_v(std_v));
+        if let Some(integral) = &mut self.integral {
+            integral.set(self.age, slope, lag_s, bound_v);
+        }
+        if let Some(repetition) = &mut self.repetition {
+            repetition.set(self.age, slope, lag_s);
+        }
+        while let Some((number, read_um)) = self.readings.pop_front() {
+            let (wanted_um, before_um) = (self.asked(number), self.asked(number - 1));
+            let mut repeats = false;
+            if let Some(repetition) = &mut self.repetition {
+                repetition.read(number, wanted_um - read_um);
+                repeats = repetition.active;
+            }
+            if let Some(integral) = self.integral.as_mut().filter(|_| !repeats) {
+                integral.take(wanted_um - read_um, (wanted_um - before_um) / self.dt_s);
+            }
+        }
+    }
+
+    /// Take what the points got in the end, V; readings of those with flags are no residual.
+    pub(crate) fn answered(&mut self, u_v: &[f64], flags: &[u8]) {
+        let integral_v = self.integral_v();
+        for (k, (u_v, flags)) in u_v.iter().zip(flags).enumerate() {
+            let number = self.number + k as i64;
+            if *flags != 0 {
+                self.wanted_um[number as usize % KEPT] = f64::NAN;
+            }
+            if let Some(repetition) = &mut self.repetition {
+                repetition.applied(number, u_v - integral_v);
+            }
         }
         self.number += flags.len() as i64;
     }
 
-    /// Begin with a correction of `u_v`, V, as far as it is within its bound: a stage that is driven already.
+    /// Begin with an integral of `u_v`, V, as far as it is within its bound: a stage that is driven already.
     pub(crate) fn begin(&mut self, u_v: f64, std_v: f64) {
-        if u_v.is_finite() {
-            self.integral.begin(u_v, self.bound_v(std_v));
+        let bound_v = self.bound_v(std_v);
+        if let Some(integral) = self.integral.as_mut().filter(|_| u_v.is_finite()) {
+            integral.begin(u_v, bound_v);
         }
     }
 
     /// A new model gives a voltage that is by `changed_v` above that of the one before.
     pub(crate) fn hand_over(&mut self, changed_v: f64) {
-        if changed_v.is_finite() {
-            self.integral.hand_over(changed_v);
+        if let Some(integral) = self.integral.as_mut().filter(|_| changed_v.is_finite()) {
+            integral.hand_over(changed_v);
         }
     }
 

@@ -1,7 +1,7 @@
 //! The C interface of `include/dehyst.h`. Panics do not cross it.
 
 use crate::answer::{Limits, Out};
-use crate::correction::CorrectionSettings;
+use crate::correction::{Correcting, CorrectionSettings};
 use crate::delta::Update;
 use crate::error::{Error, Result};
 use crate::follower::{Follower, Publisher};
@@ -49,14 +49,24 @@ pub struct CCorrection {
     fade_s: f64,
 }
 
+/// One of the two corrections; zeros where the axis has none.
 #[repr(C)]
-pub struct CCorrected {
+#[derive(Default)]
+pub struct CAdded {
     u_v: f64,
     factor: f64,
-    noise_um: f64,
-    age: i64,
     halved: u64,
     doubted: u64,
+}
+
+#[repr(C)]
+pub struct CCorrected {
+    integral: CAdded,
+    repetition: CAdded,
+    noise_um: f64,
+    period: f64,
+    age: i64,
+    active: u32,
 }
 
 #[repr(C)]
@@ -150,6 +160,11 @@ unsafe fn follower<'a>(handle: *mut Handle) -> Result<&'a mut Follower> {
     Ok(&mut *handle.follower.get())
 }
 
+unsafe fn correcting<'a>(handle: *mut Handle) -> Result<&'a mut Correcting> {
+    let own = follower(handle)?.correcting();
+    own.ok_or_else(|| Error::new("handle", "no correction", "dehyst_correct before"))
+}
+
 /// Version of the wire and of this interface: 1.
 #[no_mangle]
 pub extern "C" fn dehyst_version() -> u32 {
@@ -216,12 +231,30 @@ pub unsafe extern "C" fn dehyst_advance(handle: *mut Handle, n: usize, y_um: *co
 }
 
 /// # Safety
-/// `handle` is open and not in use by another thread; `settings` is valid.
+/// `handle` is open and not in use by another thread; `integral` and `repetition` are valid, or null.
 #[no_mangle]
-pub unsafe extern "C" fn dehyst_correct(handle: *mut Handle, settings: *const CCorrection) -> c_int {
+pub unsafe extern "C" fn dehyst_correct(
+    handle: *mut Handle,
+    integral: *const CCorrection,
+    repetition: *const CCorrection,
+) -> c_int {
     guarded(|| {
-        let CCorrection { share, mode_hz, fade_s } = *settings.as_ref().ok_or_else(|| missing("settings"))?;
-        follower(handle)?.correct(CorrectionSettings { share, mode_hz, fade_s })
+        let settings = |given: &CCorrection| {
+            let CCorrection { share, mode_hz, fade_s } = *given;
+            CorrectionSettings { share, mode_hz, fade_s }
+        };
+        follower(handle)?.correct(integral.as_ref().map(settings), repetition.as_ref().map(settings))
+    })
+}
+
+/// # Safety
+/// `handle` is open and not in use by another thread.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_period(handle: *mut Handle, period_s: f64) -> c_int {
+    guarded(|| {
+        let repetition = correcting(handle)?.repetition.as_mut();
+        let repetition = repetition.ok_or_else(|| Error::new("handle", "no repetition", "its settings before"))?;
+        repetition.state((!period_s.is_nan()).then_some(period_s))
     })
 }
 
@@ -244,18 +277,28 @@ pub unsafe extern "C" fn dehyst_read(handle: *mut Handle, n: usize, seq: *const 
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_corrected(handle: *mut Handle, on: c_int, corrected: *mut CCorrected) -> c_int {
     guarded(|| {
-        let correcting = follower(handle)?.correcting();
-        let own = correcting.ok_or_else(|| Error::new("handle", "no correction", "dehyst_correct before"))?;
+        let own = correcting(handle)?;
         own.on = on != 0;
         if let Some(corrected) = corrected.as_mut() {
-            let integral = &own.integral;
+            let integral = own.integral.as_ref();
+            let repetition = own.repetition.as_ref();
             *corrected = CCorrected {
-                u_v: integral.u_v,
-                factor: integral.factor,
-                noise_um: integral.noise_um,
+                integral: integral.map_or_else(CAdded::default, |own| CAdded {
+                    u_v: own.u_v,
+                    factor: own.factor,
+                    halved: own.halved,
+                    doubted: own.doubted,
+                }),
+                repetition: repetition.map_or_else(CAdded::default, |own| CAdded {
+                    u_v: own.u_v,
+                    factor: own.factor,
+                    halved: own.halved,
+                    doubted: own.doubted,
+                }),
+                noise_um: integral.map_or(f64::NAN, |own| own.noise_um),
+                period: repetition.and_then(|own| own.period).unwrap_or(f64::NAN),
                 age: own.age,
-                halved: integral.halved,
-                doubted: integral.doubted,
+                active: repetition.is_some_and(|own| own.active).into(),
             };
         }
         Ok(())

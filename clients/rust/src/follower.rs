@@ -193,13 +193,19 @@ impl Follower {
         })
     }
 
-    /// Correct the voltages by the readings that `read` takes (docs/correction.md). Points need numbers: `number`.
-    pub fn correct(&mut self, settings: CorrectionSettings) -> Result<()> {
-        self.correcting = Some(Correcting::new(settings, &self.limits, self.current.snapshot.model.dt_s)?);
+    /// Correct the voltages by the readings that `read` takes (docs/correction.md): by an `integral` of the residual, and
+    /// motion that repeats by the pass before. None: not so. Points need numbers: `number`.
+    pub fn correct(
+        &mut self,
+        integral: Option<CorrectionSettings>,
+        repetition: Option<CorrectionSettings>,
+    ) -> Result<()> {
+        let dt_s = self.current.snapshot.model.dt_s;
+        self.correcting = Some(Correcting::new(integral, repetition, &self.limits, dt_s)?);
         Ok(())
     }
 
-    /// The correction, to look at and to switch.
+    /// The corrections, to look at and to switch.
     pub fn correcting(&mut self) -> Option<&mut Correcting> {
         self.correcting.as_mut()
     }
@@ -242,7 +248,7 @@ impl Follower {
         if newest.snapshot.memory.len() != self.memory.len() {
             std::mem::swap(&mut self.memory, &mut newest.snapshot.room);
         } else if let (Some(next), Some(correcting)) = (next, &mut self.correcting) {
-            if correcting.integral.u_v != 0.0 && next.iter().all(|value| value.is_finite()) {
+            if correcting.integral_v() != 0.0 && next.iter().all(|value| value.is_finite()) {
                 let before = voltage_at(&mut self.current.snapshot, &self.memory, next).0;
                 correcting.hand_over(voltage_at(&mut newest.snapshot, &self.memory, next).0 - before);
             }
@@ -280,7 +286,7 @@ impl Follower {
         memory.copy_from_slice(&self.memory);
         let (mut u_v, mut std_v, mut flags) = ([0.0], [0.0], [0]);
         let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
-        answer::answer(snapshot, &mut memory, &motion, self.u_before_v, &self.limits, age_s, |_| 0.0, &mut out);
+        answer::answer(snapshot, &mut memory, &motion, self.u_before_v, &self.limits, age_s, |_| {}, &mut out);
         snapshot.spare = memory;
         // Without this the compiler may leave out what nobody reads.
         std::hint::black_box(u_v);
@@ -311,17 +317,21 @@ impl Follower {
             return Err(Error::new("n", n, "at least one point, and as many places for the answers"));
         }
         let snapshot = &mut self.current.snapshot;
+        let troubled = !snapshot.trouble.is_empty() || snapshot.trust_by_age(age_s).1;
         let mut correcting = self.correcting.as_mut().filter(|correcting| correcting.number >= 0);
         if let Some(correcting) = &mut correcting {
             let Snapshot { model, scratch, spare, .. } = &mut *snapshot;
-            correcting.ask(y_um, model, &self.memory, spare, scratch);
+            correcting.ask(y_um, model, &self.memory, spare, scratch, troubled);
         }
-        let troubled = !snapshot.trouble.is_empty() || snapshot.trust_by_age(age_s).1;
-        let correct = |std_v| correcting.as_mut().map_or(0.0, |correcting| correcting.voltage(n, std_v, troubled));
+        let correct = |out: &mut Out| {
+            if let Some(correcting) = &mut correcting {
+                correcting.correct(y_um, out.u_v, out.std_v[0], troubled);
+            }
+        };
         let (memory, before_v) = (&mut self.memory, self.u_before_v);
         self.done = answer::answer(snapshot, memory, &motion, before_v, &self.limits, age_s, correct, out);
         if let Some(correcting) = correcting {
-            correcting.answered(out.flags);
+            correcting.answered(out.u_v, out.flags);
         }
         self.begins = false;
         self.last = Point { u_v: out.u_v[n - 1], std_v: out.std_v[n - 1], flags: out.flags[n - 1] };

@@ -28,6 +28,7 @@ mod follower;
 pub mod json;
 mod kernel;
 mod model;
+pub mod repetition;
 mod snapshot;
 pub mod wire;
 

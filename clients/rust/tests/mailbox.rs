@@ -48,7 +48,8 @@ fn read(name: &str) -> Vec<u8> {
 fn points_and_blocks_allocate_and_free_nothing() {
     let (first, jumped, changed) = (read("auto"), read("auto-jumped"), read("auto-champion-changed"));
     let mut follower = Follower::new(&first, LIMITS).unwrap();
-    follower.correct(CorrectionSettings { share: 0.02, mode_hz: 200.0, fade_s: 0.5 }).unwrap();
+    let settings = Some(CorrectionSettings { share: 0.02, mode_hz: 200.0, fade_s: 0.5 });
+    follower.correct(settings, settings).unwrap();
     let publisher = follower.publisher();
     let (mut u, mut std, mut flags) = ([0.0; 8], [0.0; 8], [0u8; 8]);
     let mut total = 0;
@@ -72,6 +73,36 @@ fn points_and_blocks_allocate_and_free_nothing() {
     }
     assert_eq!(total, 0);
     assert_eq!(follower.report().received, 61);
+}
+
+#[test]
+fn motion_that_repeats_is_found_learnt_and_forgotten_without_allocation() {
+    let mut follower = Follower::new(&read("bouc_wen"), LIMITS).unwrap();
+    let settings = Some(CorrectionSettings { share: 0.02, mode_hz: 200.0, fade_s: 0.5 });
+    follower.correct(settings, settings).unwrap();
+    let before = CALLS.with(Cell::get);
+    let (mut active, mut periods) = (0, [0; 3]);
+    // The motion changes twice, and the second one is of a period that is stated.
+    let part = |k: i64| usize::from(k >= 9000) + usize::from(k >= 12_000);
+    let period = |k: i64| [66.6667, 50.5, 33.25][part(k)];
+    let wanted_um = |k: i64| 40.0 + 10.0 * (2.0 * std::f64::consts::PI * k as f64 / period(k)).sin();
+    // Beyond the end of what is kept.
+    for k in 0..20_000 {
+        if k == 9000 || k == 12_000 {
+            let stated = (k == 9000).then_some(0.0505);
+            follower.correcting().unwrap().repetition.as_mut().unwrap().state(stated).unwrap();
+        }
+        follower.number(k).unwrap();
+        let seen = k - 1 - k / 4000; // the readings grow older
+        follower.read(&[seen], &[wanted_um(seen) + 0.02]).unwrap();
+        follower.point(wanted_um(k), 0.0, 0.0).unwrap();
+        let repetition = follower.correcting().unwrap().repetition.as_ref().unwrap();
+        active += u64::from(repetition.active);
+        periods[part(k)] += u64::from(repetition.period.is_some_and(|found| (found - period(k)).abs() < 0.01));
+    }
+    assert_eq!(CALLS.with(Cell::get), before);
+    assert!(active > 10_000, "{active}");
+    assert!(periods.iter().all(|count| *count > 2000), "{periods:?}");
 }
 
 #[test]

@@ -300,34 +300,56 @@ fn points_one_by_one_are_the_block() {
     assert!(compared > 15, "{compared}");
 }
 
-#[test]
-fn a_correction_is_that_of_the_follower_of_the_service() {
-    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
-    let text = String::from_utf8(read("correction.txt")).unwrap();
+/// (model, settings of the integral, settings of the repetition) in the first line of a table.
+fn corrections(table: &str) -> (String, Option<CorrectionSettings>, Option<CorrectionSettings>) {
+    let text = String::from_utf8(read(table)).unwrap();
     let head: Vec<&str> = text.lines().next().unwrap().split_whitespace().collect();
-    let [share, mode_hz, fade_s] = [2, 3, 4].map(|at| head[at].parse().unwrap());
-    let mut follower = Follower::new(&read(head[1]), limits).unwrap();
-    follower.correct(CorrectionSettings { share, mode_hz, fade_s }).unwrap();
+    let settings = |at: usize| {
+        let [share, mode_hz, fade_s] = [at, at + 1, at + 2].map(|at| head[at].parse::<f64>().unwrap());
+        (!share.is_nan()).then_some(CorrectionSettings { share, mode_hz, fade_s })
+    };
+    (head[1].to_string(), settings(2), settings(5))
+}
+
+#[test]
+fn corrections_are_those_of_the_follower_of_the_service() {
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
     let number = |text: &str| text.parse::<f64>().unwrap();
-    let rows = rows("correction.txt");
-    for row in &rows {
-        let seq: i64 = row[0].parse().unwrap();
-        if row[3] != "-" {
-            follower.publisher().publish(&read(&row[3])).unwrap();
+    for table in ["correction.txt", "repetition.txt"] {
+        let (model, integral, repetition) = corrections(table);
+        let mut follower = Follower::new(&read(&model), limits).unwrap();
+        follower.correct(integral, repetition).unwrap();
+        let rows = rows(table);
+        for row in &rows {
+            let seq: i64 = row[0].parse().unwrap();
+            if row[3] != "-" {
+                follower.publisher().publish(&read(&row[3])).unwrap();
+            }
+            if row[4] != "-" {
+                let stated = Some(number(&row[4])).filter(|period_s| !period_s.is_nan());
+                follower.correcting().unwrap().repetition.as_mut().unwrap().state(stated).unwrap();
+            }
+            if row[5] != "-" {
+                follower.read(&[row[5].parse().unwrap()], &[number(&row[6])]).unwrap();
+            }
+            follower.number(seq).unwrap();
+            let got = follower.point(number(&row[1]), number(&row[2]), 0.0).unwrap();
+            let correcting = follower.correcting().unwrap();
+            let own = correcting.integral.as_ref().unwrap();
+            let mut state = vec![correcting.age as f64, own.u_v, own.halved as f64, own.doubted as f64];
+            state.extend(correcting.repetition.as_ref().map_or([0.0, 0.0, 0.0, f64::NAN, 0.0], |own| {
+                let period = own.period.unwrap_or(f64::NAN);
+                [own.u_v, own.halved as f64, own.doubted as f64, period, f64::from(u8::from(own.active))]
+            }));
+            let expected: Vec<f64> = row[8..].iter().map(|text| number(text)).collect();
+            same(&format!("{table}: u_V of {seq}"), &[got.u_v], &[number(&row[7])]);
+            same(&format!("{table}: state after {seq}"), &state, &expected);
         }
-        if row[4] != "-" {
-            follower.read(&[row[4].parse().unwrap()], &[number(&row[5])]).unwrap();
-        }
-        follower.number(seq).unwrap();
-        let got = follower.point(number(&row[1]), number(&row[2]), 0.0).unwrap();
-        let correcting = follower.correcting().unwrap();
-        same(&format!("u_V of {seq}"), &[got.u_v], &[number(&row[6])]);
-        same(&format!("correction of {seq}"), &[correcting.integral.u_v], &[number(&row[7])]);
-        let state = (correcting.age, correcting.integral.halved, correcting.integral.doubted);
-        let expected = (row[8].parse().unwrap(), row[9].parse().unwrap(), row[10].parse().unwrap());
-        assert_eq!(state, expected, "{seq}");
+        let most = |at: usize| rows.iter().map(|row| number(&row[at])).fold(0.0, f64::max);
+        // The gain was halved, and readings were doubted, of what the table is of.
+        let own = if repetition.is_some() { 13 } else { 10 };
+        assert!(rows.len() >= 1000 && most(own) > 0.0 && most(own + 1) > 0.0, "{table}");
     }
-    assert!(rows.len() >= 1000 && rows.last().unwrap()[9] != "0" && rows.last().unwrap()[10] != "0");
 }
 
 #[test]
@@ -341,12 +363,20 @@ fn what_a_correction_cannot_use_is_refused_and_changes_nothing() {
         ("mode_Hz", CorrectionSettings { mode_hz: f64::NAN, ..good }),
         ("fade_s", CorrectionSettings { fade_s: -1.0, ..good }),
     ] {
-        assert_eq!(follower.correct(bad).unwrap_err().field, field);
+        assert_eq!(follower.correct(Some(bad), None).unwrap_err().field, format!("correction.{field}"));
+        assert_eq!(follower.correct(Some(good), Some(bad)).unwrap_err().field, format!("repetition.{field}"));
         assert!(follower.correcting().is_none());
     }
     let endless = Limits { y_max_um: f64::INFINITY, ..limits };
-    assert!(Follower::new(&read("lssvm.model.payload"), endless).unwrap().correct(good).is_err());
-    follower.correct(good).unwrap();
+    assert!(Follower::new(&read("lssvm.model.payload"), endless).unwrap().correct(Some(good), None).is_err());
+    follower.correct(None, Some(good)).unwrap();
+    let repetition = follower.correcting().unwrap().repetition.as_mut().unwrap();
+    repetition.state(Some(0.1)).unwrap();
+    for period_s in [0.0, -1.0, 1e-3, 10.0, f64::NAN] {
+        assert_eq!(repetition.state(Some(period_s)).unwrap_err().field, "period_s");
+        assert_eq!(repetition.period, Some(100.0));
+    }
+    follower.correct(Some(good), None).unwrap();
     assert_eq!(follower.number(-1).unwrap_err().field, "seq");
     assert_eq!(follower.read(&[1, 2], &[40.0]).unwrap_err().field, "y_um");
     assert_eq!(follower.read(&[1, 1], &[40.0, 40.0]).unwrap_err().field, "seq[1]");

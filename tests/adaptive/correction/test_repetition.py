@@ -252,6 +252,27 @@ def test_a_loop_that_grows_is_let_go_with_half_the_gain() -> None:
     assert errors.max() < 4.0 * errors[1]
 
 
+def test_growth_is_seen_after_readings_of_the_first_pass_came_late() -> None:
+    one = Repetition(1e-3, 200.0, 0.5)
+    one.state(0.1)
+
+    def step(k: int, seen: list[int], residual_um: float) -> None:
+        one.set(1, 0.5, 2e-3, 2.0)
+        for number in seen:
+            one.read(number, residual_um * math.sin(4e-2 * math.pi * number))
+        y_um = 10.0 * math.sin(2e-2 * math.pi * k)
+        one.applied(k, 0.5 * y_um + one.add(k, y_um, 0.5 * y_um))
+
+    k = 0
+    while not one.active:
+        step(k, [k - 1] if k > 50 else [], 0.05)
+        k += 1
+    step(k, [*range(3, 50), k - 1], 0.05)
+    for later in range(k + 1, k + 150):
+        step(later, [later - 1], 0.05 if later < k + 110 else 0.5)
+    assert one.halved == 1
+
+
 def test_a_residual_that_changes_its_sign_from_pass_to_pass_grows_little() -> None:
     """A slope of three and a half times the right one: 1 - GAIN 3.5 = -1.45."""
     loop = Loop(66.6667, slope=1.75)
