@@ -34,8 +34,8 @@ from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Ev
 from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
 from dehyst.lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
 from dehyst.lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
+from dehyst.service.answers.correcting import Answer, Correcting
 from dehyst.service.answers.guard import Limits
-from dehyst.service.client.correcting import Answer, Correcting
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.config.settings import LEARN, AxisConfig
