@@ -99,6 +99,8 @@ def test_the_classes_of_events_are_listed(capsys: pytest.CaptureFixture[str]) ->
         ("mine.py:Stage", ("--events", "thunder"), "some of none"),
         ("mine.py:Stage", ("--seed", "-1"), "--seed"),
         ("mine.py:Stage", ("--settle", "0"), "at least 2 s before"),
+        ("mine.py:Stage", ("--controllers", "0,5"), "--controllers"),
+        ("mine.py:Stage", ("--mode-hz", "0"), "--mode-hz"),
         ("broken.py:Stage", (), "ZeroDivisionError"),
     ],
 )
