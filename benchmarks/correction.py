@@ -25,31 +25,19 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.signal import butter, filtfilt
 
-from dehyst.adaptive.correction.integral import Correction, sensitivity
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.rehearsal import RehearsalConfig, identify
-from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Event, EventScale
-from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, go_to_lowest
-from dehyst.lab.rehearsal.reference import Motion, RandomReference, ReferenceRequest
-from dehyst.lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
-from dehyst.service.answers.guard import Limits
-from dehyst.service.client.correcting import Answer, Correcting
-from dehyst.service.client.follower import Follower
-from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
-from dehyst.service.config.settings import LEARN, AxisConfig
-from dehyst.service.protocol.model import ModelMessage, encode_model
-from dehyst.service.protocol.samples import SampleBatch
+from dehyst.lab.rehearsal.controllers import COUNT_S, EVENT_S, SECONDS, SHOWN, Course, line_errors_pct
+from dehyst.lab.rehearsal.disturbance import Event
+from dehyst.lab.rehearsal.reference import Motion
 from dehyst.service.reports.tables import markdown
-from dehyst.service.server.axis_loading import load_axis
-from tests.foreign.motions import BEGIN_S, motion
+from tests.foreign.motions import motion
 from tests.foreign.plants import random_plant
 
 Record = dict[str, Any]
 
-#: Controllers: the learning feedforward alone and with the correction; the frozen one with an integral of the same
-#: gain, without bound or doubts, and alone; that integral alone.
+#: Controllers, see `lab.rehearsal.controllers`.
 WAYS: Final = ("alone", "corrected", "frozen+I", "frozen", "I")
 AGES: Final = (1, 5, 20)
 #: What happens: event, controllers and ages.
@@ -61,18 +49,10 @@ CASES: Final = {
     "sensor_gain": (("alone", "corrected"), (5,)),
     "drift": (("alone", "corrected"), (5,)),
 }  # fmt: skip
-#: Rasters: case, lines that are followed, and lines that are shown; controllers. "iterative" begins with the mean slope
-#: of the stage, "frozen+iterative" with the identified model.
+#: Rasters: case and controllers.
 RASTER: Final = "raster"
 RASTERS_HZ: Final = (5.0, 15.0, 30.0)
-LINES, SHOWN = 20, (1, 5, 10, 20)
 RASTER_WAYS: Final = ("repetition", "iterative", "frozen+iterative", "alone", "corrected", "frozen+I", "I")
-#: The iterative control: share of the error that a line corrects, and its cut-off as a share of ``mode_Hz``.
-ITERATIVE: Final = (0.5, 0.7)
-#: Length of a run, when its event happens, and when its errors begin to count, s.
-SECONDS: Final = 6.0
-EVENT_S: Final = 4.0
-COUNT_S: Final = 2.0
 #: A stage at rest rests from here on, and its jitter counts so much later, s.
 REST_S: Final = 3.0
 SETTLED_S: Final = 1.0
@@ -85,53 +65,16 @@ NO_MODE_HZ: Final = 300.0
 OF_MODE: Final = 1.0 / math.sqrt(3.0)
 #: Faster stages are left out: a run of them takes minutes.
 FASTEST_S: Final = 4e-4
-RESYNCHRONISE_S: Final = 0.25
-SNAPSHOT_EVERY: Final = 5
 LARGE_PCT: Final = 5.0
 
 
-class Unbounded(Correcting):
-    """The rival: the same integral, that keeps to the drive's range alone and doubts nothing."""
-
-    def __init__(self, config: CorrectionConfig, limits: Limits, dt_s: float) -> None:
-        super().__init__(replace(config, share=1.0), limits, dt_s)
-
-    def voltage(
-        self, first: int, model: Any, points: Any, memory: FloatArray, answer: Answer, trouble: str = ""
-    ) -> FloatArray:
-        """As of a model of unknown error, whatever the service says."""
-        return super().voltage(first, model, points, memory, (answer[0], math.inf))
-
-
 @dataclass(frozen=True, slots=True)
-class Course:
-    """A stage, identified, and the motion that all controllers are to make it follow."""
+class ForeignCourse(Course):
+    """A stage of others. ``name`` : of its hysteresis."""
 
-    seed: int
-    name: str
-    make: PlantFactory
-    low_V: float
-    mode_Hz: float
-    known: IdentifiedPlant
-    wanted: Motion
-    range_um: float
-    raster_Hz: float = math.nan
+    name: str = ""
 
-    @classmethod
-    def of(cls, seed: int) -> Course:
-        """The stage of ``seed``, and a motion of its own."""
-        factory = random_plant(seed)
-        traits = factory.traits
-        low_V, high_V = traits.excite_V
-        known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
-        mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
-        span, n = known.high_um - known.low_um, round(SECONDS / known.dt_s)
-        wish = ReferenceRequest(known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, SECONDS, seed)
-        wanted = RandomReference(wish)(np.arange(n) * known.dt_s)
-        range_um = float(np.ptp(wanted.y_um[round(2.0 / known.dt_s) :]))
-        return cls(seed, traits.hysteresis, factory, low_V, mode_Hz, known, wanted, range_um)
-
-    def at_rest(self) -> Course:
+    def at_rest(self) -> ForeignCourse:
         """The same motion, which comes to rest with a smooth ramp after `REST_S`."""
         dt_s, y = self.known.dt_s, self.wanted.y_um
         t_s = np.arange(y.size) * dt_s - REST_S
@@ -141,18 +84,6 @@ class Course:
         moved = level + weight * (y - level)
         speed = np.gradient(moved, dt_s)
         return replace(self, wanted=Motion(moved, speed, np.gradient(speed, dt_s)))
-
-    def raster(self, frequency_Hz: float) -> Course:
-        """A triangle of so many hertz on the same stage, after a rest and a slow move to its lower turn."""
-        known = self.known
-        span, until_s = known.high_um - known.low_um, BEGIN_S + LINES / frequency_Hz
-        wish = ReferenceRequest(
-            known.rest_um, known.low_um + 0.1 * span, known.low_um + 0.9 * span, until_s, self.seed
-        )  # fmt: skip
-        t_s = np.arange(math.ceil(until_s / known.dt_s)) * known.dt_s
-        wanted = motion(f"raster:{frequency_Hz}")(wish)(t_s)
-        range_um = float(np.ptp(wanted.y_um[t_s >= BEGIN_S]))
-        return replace(self, wanted=wanted, range_um=range_um, raster_Hz=frequency_Hz)
 
     def event(self, name: str) -> Event:
         """What happens in the case ``name``."""
@@ -164,138 +95,31 @@ class Course:
         return Event(name, kind, EVENT_S, size.get(name, 0.0), over_s, self.seed)
 
 
-class _Integral:
-    """The rival without a feedforward: the mean slope of the stage, and the same design."""
-
-    def __init__(self, course: Course, config: CorrectionConfig, age: int) -> None:
-        known = course.known
-        gain = float(np.polyfit(known.u_V, known.y_um, 1)[0])
-        self._limits, self._low_V = known.limits, course.low_V
-        self._integral = Correction(known.dt_s, config.mode_Hz, config.fade_s)
-        self._integral.set(age, 1.0 / gain, 0.0, 1e9)
-
-    def voltage(self, residual_um: float) -> float:
-        """The next voltage, V, after a residual, µm; without wind-up at the limits."""
-        self._integral.take(residual_um, math.inf)
-        u_V = min(max(self._low_V + self._integral.u_V, self._limits.u_min_V), self._limits.u_max_V)
-        self._integral.u_V = u_V - self._low_V
-        return u_V
+def course_of(seed: int) -> ForeignCourse:
+    """The stage of ``seed``, and a motion of its own."""
+    factory = random_plant(seed)
+    traits = factory.traits
+    low_V, high_V = traits.excite_V
+    known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
+    mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
+    return ForeignCourse.of(factory, known, low_V, mode_Hz, seed, name=traits.hysteresis)
 
 
-class _Iterative:
-    """The rival of the repetition: an iterative learning control, u <- Q (u + gain slope e), line by line.
-
-    Q is a Butterworth low-pass, forth and back; e leads by the identified lag.
-    """
-
-    def __init__(self, course: Course, config: CorrectionConfig) -> None:
-        known, self._gain = course.known, ITERATIVE[0]
-        model = known.models[LEARN]
-        lag_s = sensitivity(model, known.rest_um, model.rest_memory(known.rest_um), known.high_um - known.low_um)[1]
-        self._slope = 1.0 / float(np.polyfit(known.u_V, known.y_um, 1)[0])
-        self._rise = self._slope * (course.wanted.y_um - course.wanted.y_um[0]) + course.low_V
-        self._filter = butter(2, min(2.0 * ITERATIVE[1] * config.mode_Hz * known.dt_s, 0.9))
-        self._period, self._begin = 1.0 / course.raster_Hz / known.dt_s, BEGIN_S / known.dt_s
-        self._lead, self._table = lag_s / known.dt_s, np.empty(0)
-        self._pass: list[tuple[float, float, float]] = []
-
-    def read(self, seen: int, u_V: float, error_um: float) -> None:
-        """Take the error, µm, of a sample that got ``u_V``; learns once a line is complete."""
-        if seen < self._begin:
-            return
-        place = (seen - self._begin) % self._period
-        if self._pass and place < self._pass[-1][0]:
-            at, u, e = np.array(self._pass).T
-            self._places = np.arange(math.ceil(self._period)) * self._period / math.ceil(self._period)
-            if not self._table.size:
-                self._table = np.interp(self._places, at, u, period=self._period)
-            e = np.interp(self._places + self._lead, at, e, period=self._period)
-            table = np.tile(self._table + self._gain * self._slope * e, 3)
-            self._table = filtfilt(*self._filter, table)[self._places.size : 2 * self._places.size]
-            self._pass.clear()
-        self._pass.append((place, u_V, error_um))
-
-    def voltage(self, k: int, first_V: float | None = None) -> float:
-        """The voltage, V, of a sample; until a line has been learnt ``first_V``, or by the mean slope."""
-        if self._table.size:
-            return float(np.interp((k - self._begin) % self._period, self._places, self._table, period=self._period))
-        return float(self._rise[k]) if first_V is None else first_V
-
-
-def follow(course: Course, way: str, age: int, case: str) -> Record:
+def follow(course: ForeignCourse, way: str, age: int, case: str) -> Record:
     """(n,) true positions, µm, and corrections, V, of a run, and the counts of its correction."""
-    known, wanted, event = course.known, course.wanted, course.event(case)
-    config = CorrectionConfig(on=True, mode_Hz=course.mode_Hz)
-    dt_s, n, low_V = known.dt_s, wanted.y_um.size, course.low_V
-    axis = load_axis(
-        STAGE, AxisConfig(AXIS, Path("benchmark"), known.limits, compete=(), snapshot_every=SNAPSHOT_EVERY),
-        bundle=bundle_of(known),
-    )  # fmt: skip
-    inner = course.make()
-    go_to_lowest(inner, low_V)
-    middle_um = 0.5 * (known.low_um + known.high_um)
-    scale = EventScale(course.range_um, middle_um, known.rest_um)
-    plant, sensor = DisturbedPlant(inner, event, scale), DisturbedSensor(event, scale, dt_s, n)
-    drift_um = DRIFT_PER_S * course.range_um * np.maximum(np.arange(n) * dt_s - EVENT_S, 0.0) * (case == "drift")
-    rest = round(0.2 / dt_s)
-    numbers, rest_V = np.arange(1, rest + 1), np.full(rest, low_V)
-    axis.handle(SampleBatch(numbers, numbers * dt_s, rest_V, plant.run(-rest, rest_V)[1]))
-    first, limits = rest + 1, axis.limits
-
-    def newest() -> ModelMessage:
-        model, seq, memory = axis.model(LEARN)
-        return ModelMessage(LEARN, model, seq, memory, axis.safety(LEARN))
-
-    made = {"corrected": Correcting, "frozen+I": Unbounded}
-    correcting = made[way](config, limits, dt_s) if way in made else None
-    if way == "repetition":
-        correcting = Correcting(config, limits, dt_s, RepetitionConfig(on=True, mode_Hz=course.mode_Hz))
-    begun = newest()
-    payload = encode_model(LEARN, begun.model, begun.snapshot_seq, begun.memory, begun.safety)
-    follower = Follower(None, None, LEARN, lambda: payload, limits, correcting=correcting)  # type: ignore[arg-type]
-    integral = _Integral(course, config, age) if way == "I" else None
-    iterative = _Iterative(course, config) if "iterative" in way else None
-    learns = way in ("alone", "corrected", "repetition")
-    true_um, read_um, u_V, added_V = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    y, v, a = (column.tolist() for column in wanted)
-    every, served = round(RESYNCHRONISE_S / dt_s), axis.newest
-    for k in range(n):
-        seen = k - age
-        if seen >= 0 and learns:
-            number = np.array([first + seen])
-            axis.handle(SampleBatch(number, number * dt_s, u_V[seen : seen + 1], read_um[seen : seen + 1]))
-            if axis.newest is not served:
-                served = axis.newest
-                follower._take(newest())
-            if k % every == every - 1:
-                part = np.arange(max(follower.snapshot_seq - 1 - first, 0), seen + 1)
-                follower.resynchronise(first + part, u_V[part], read_um[part])
-        if iterative is not None and seen >= 0:
-            iterative.read(seen, u_V.item(seen), y[seen] - read_um.item(seen))
-        if way == "iterative" and iterative is not None:
-            u_V[k] = min(max(iterative.voltage(k), limits.u_min_V), limits.u_max_V)
-        elif integral is not None:
-            u_V[k] = integral.voltage(y[seen] - read_um.item(seen)) if seen >= 0 else low_V
-        else:
-            if seen >= 0:
-                follower.read(first + seen, read_um[seen])
-            u_V[k] = follower.point(y[k], v[k], a[k], seq=first + k)
-            if iterative is not None:
-                u_V[k] = min(max(iterative.voltage(k, u_V.item(k)), limits.u_min_V), limits.u_max_V)
-        added_V[k] = 0.0 if correcting is None or correcting.correction is None else correcting.correction.u_V
-        true, read = plant.run(k, u_V[k : k + 1])
-        true_um[k] = true[0]
-        read_um[k] = sensor.read(k, read)[0] + drift_um[k]
-    integrals = correcting.correction if correcting is not None else None
-    counts: Record = {} if integrals is None else {
-        "halved": integrals.halved, "doubted": integrals.doubted, "gain_per_s": integrals.loop.gain_per_s,
-    }  # fmt: skip
+    got, following, axis = course.follow(way, age, course.event(case), DRIFT_PER_S * (case == "drift"))
+    correcting = None if following is None else following.correcting
+    counts: Record = {}
+    if correcting is not None and correcting.correction is not None:
+        integral = correcting.correction
+        counts = {"halved": integral.halved, "doubted": integral.doubted, "gain_per_s": integral.loop.gain_per_s}
     if correcting is not None and correcting.repetition is not None:
         counts |= {"repetition_halved": correcting.repetition.halved, "period": correcting.repetition.period}
-    return {"true_um": true_um, "added_V": added_V, "trouble": axis.newest.trouble, **counts}
+    added_V = np.zeros(got.u_V.size) if following is None or not following.added_V else np.array(following.added_V)
+    return {"true_um": got.true_um, "added_V": added_V, "trouble": axis.newest.trouble, **counts}
 
 
-def figures(course: Course, got: Record) -> Record:
+def figures(course: ForeignCourse, got: Record) -> Record:
     """Errors in percent of the range, as JSON values."""
     dt_s, limits = course.known.dt_s, course.known.limits
     error = 100.0 / course.range_um * np.abs(course.wanted.y_um - got["true_um"])
@@ -312,15 +136,16 @@ def figures(course: Course, got: Record) -> Record:
     }  # fmt: skip
 
 
-def lines(course: Course, got: Record) -> Record:
+def lines(course: ForeignCourse, got: Record) -> Record:
     """Mean error of each line in percent of the range, as JSON values."""
-    error = 100.0 / course.range_um * np.abs(course.wanted.y_um - got["true_um"])
-    line = np.floor((np.arange(error.size) * course.known.dt_s - BEGIN_S) * course.raster_Hz + 1e-9)
+    errors = line_errors_pct(course.wanted.y_um, got["true_um"], course.raster_Hz, course.known.dt_s)
     counts = {key: got[key] for key in ("halved", "repetition_halved", "period", "trouble") if key in got}
-    return {"lines": [float(error[line == k].mean()) for k in range(LINES)], **counts}
+    return {"lines": errors.tolist(), **counts}
 
 
-def run_one(course: Course, way: str, age: int, case: str, measure: Callable[[Course, Record], Record]) -> Record:
+def run_one(
+    course: ForeignCourse, way: str, age: int, case: str, measure: Callable[[ForeignCourse, Record], Record]
+) -> Record:
     """One run by its measures; one that raises has its traceback, and the others go on."""
     record: Record = {
         "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
@@ -332,17 +157,17 @@ def run_one(course: Course, way: str, age: int, case: str, measure: Callable[[Co
         return record | {"failed": traceback.format_exc()}
 
 
-def run_rasters(course: Course, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:
+def run_rasters(course: ForeignCourse, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:
     """All runs of a stage along rasters; a run that raises has its traceback."""
     records = []
     for frequency_Hz, age, way in itertools.product(RASTERS_HZ, ages, ways):
-        there = course.raster(frequency_Hz)
+        there = course.raster(frequency_Hz, motion(f"raster:{frequency_Hz}"))
         more = {"frequency_Hz": frequency_Hz, "mode_Hz": course.mode_Hz}
         records.append(run_one(there, way, age, RASTER, lines) | more)
     return records
 
 
-def run_stage(course: Course, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
+def run_stage(course: ForeignCourse, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
     """All runs of a stage; a run that raises has its traceback."""
     records = []
     for case in cases:
@@ -471,7 +296,7 @@ def main() -> None:
         seeds = (seed for seed in itertools.count(args.first) if random_plant(seed).traits.dt_s > FASTEST_S)
         for seed in itertools.islice(seeds, args.stages):
             begin = time.process_time()
-            course = Course.of(seed)
+            course = course_of(seed)
             new = run_stage(course, [case for case in args.cases if case != RASTER])
             new += run_rasters(course, args.ages, args.ways) if RASTER in args.cases else []
             records += new

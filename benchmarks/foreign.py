@@ -12,6 +12,9 @@ the file ends.
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
 on stages on which nothing happens, and adds to the file.
+
+``--controllers 1 5 20 --runs 10`` runs the corrections beside other controllers, with readings so many samples old
+(``lab.rehearsal.controllers``), and prints medians and worst ones. A stage takes a minute or two.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +117,50 @@ def run_healthy_stage(seed: int, block: int) -> Record:
     except Exception:
         record["failed"] = traceback.format_exc()
     return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+
+
+def run_controllers(seed: int, ages: Sequence[int]) -> Record:
+    """All controllers on a stage, as JSON values. If it raises, the record holds the traceback."""
+    from benchmarks.correction import course_of
+    from dehyst.lab.rehearsal import controllers
+
+    begin_cpu = time.process_time()
+    record: Record = {"seed": seed, "ages": list(ages)}
+    try:
+        course = course_of(seed)
+        found = controllers.compare(course.make, course.known, course.low_V, course.mode_Hz, ages, seed)
+        record |= {"hysteresis": course.name, "controllers": [asdict(one) for one in found]}
+    except Exception:
+        record["failed"] = traceback.format_exc()
+    return record | {"cpu_s": time.process_time() - begin_cpu}
+
+
+def controllers_table(records: Sequence[Record]) -> str:
+    """Median and worst of all stages, by controller and age."""
+    from dehyst.lab.rehearsal.controllers import HEAD, WAYS
+
+    by_row: dict[tuple[str, int], list[list[float]]] = {}
+    for record in records:
+        for one in record.get("controllers", ()):
+            errors = [one["moving_pct"], one["first_second_pct"], *one["lines_pct"]]
+            by_row.setdefault((one["way"], one["age"]), []).append(errors)
+    rows = [
+        (
+            WAYS[way], str(age),
+            *(f"{np.median(column):.3f} / {max(column):.3f}" if np.isfinite(column).all() else "-"
+              for column in zip(*errors, strict=True)),
+        )
+        for (way, age), errors in by_row.items()
+    ]  # fmt: skip
+    stages = sum("controllers" in record for record in records)
+    return f"{stages} stages, median / worst, % of the range:\n\n{markdown(HEAD, rows)}"
+
+
+def told_controllers(record: Record) -> str:
+    """The controllers of a stage in one line."""
+    if "failed" in record:
+        return told(record)
+    return f"seed {record['seed']} {record['hysteresis']}: {len(record['controllers'])} rows, {record['cpu_s']:.0f} s"
 
 
 def run_all(plan: Sequence[Run], jobs: int) -> Iterator[Record]:
@@ -528,6 +576,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--motions", metavar="NAME[,NAME]",
         help=f"run motions on stages on which nothing happens: {', '.join(MOTIONS)}; raster:10 is one of 10 Hz",
     )  # fmt: skip
+    only.add_argument(
+        "--controllers", nargs="+", type=int, metavar="AGE",
+        help="run the corrections beside other controllers, with readings so many samples old",
+    )  # fmt: skip
     only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
     only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
     given = parser.parse_args(arguments)
@@ -536,6 +588,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jobs = given.jobs if given.jobs is not None else 2 if given.line else 1
     if given.runs < 1 or jobs < 1 or given.first_seed < 0:
         parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
+    if any(age < 1 for age in given.controllers or ()):
+        parser.error(f"--controllers: got {min(given.controllers)}, expected ages of 1 sample or more")
     names = given.motions.split(",") if given.motions is not None else []
     for name in names:
         try:
@@ -551,25 +605,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"--healthy: got {given.healthy:g}, expected hours above 0 and up to 10000")
         if not 1 <= given.block <= 512:
             parser.error(f"--block: got {given.block}, expected 1 to 512")
-        records = _run_healthy(given, jobs)
-        print(healthy_table(records))
-    elif names:
-        records = _run_motions(given, names, jobs)
-        print(foreign_motions.table(records))
-    elif given.line:
-        records = run_line(jobs)
-        print(line(records))
-    elif given.table:
-        records = read(given.table)
-        motions = [record for record in records if "motion" in record]
-        healthy = [record for record in records if record.get("class") == HEALTHY]
-        others = [record for record in records if "motion" not in record and record.get("class") != HEALTHY]
-        tables = ((table, others), (healthy_table, healthy), (foreign_motions.table, motions))
-        print("\n\n".join(made(part) for made, part in tables if part) or table([]))
-    else:
-        records = _run(given, jobs)
-        print(table(records))
+    records, told_of = _carry_out(given, names, jobs)
+    print(told_of)
     return 1 if any("failed" in record for record in records) else 0
+
+
+def _carry_out(given: argparse.Namespace, names: Sequence[str], jobs: int) -> tuple[list[Record], str]:
+    """The runs that are asked for, or those of the files, and their tables. ``names`` : of motions."""
+    if given.healthy is not None:
+        records = _run_healthy(given, jobs)
+        return records, healthy_table(records)
+    if names:
+        records = _run_motions(given, names, jobs)
+        return records, foreign_motions.table(records)
+    if given.controllers:
+        seeds = range(given.first_seed, given.first_seed + given.runs)
+        plan = [(functools.partial(run_controllers, seed, given.controllers), {"seed": seed}) for seed in seeds]
+        records = _run_plan(plan, jobs, given.json, told_controllers)
+        return records, controllers_table(records)
+    if given.line:
+        records = run_line(jobs)
+        return records, line(records)
+    if not given.table:
+        records = _run(given, jobs)
+        return records, table(records)
+    records = read(given.table)
+    motions = [record for record in records if "motion" in record]
+    compared = [record for record in records if "ages" in record]
+    named = [record for record in records if "class" in record and "motion" not in record]
+    healthy = [record for record in named if record["class"] == HEALTHY]
+    others = [record for record in named if record["class"] != HEALTHY]
+    parts = (
+        (table, others), (healthy_table, healthy), (foreign_motions.table, motions), (controllers_table, compared),
+    )  # fmt: skip
+    return records, "\n\n".join(made(part) for made, part in parts if part) or table([])
 
 
 def _run(given: argparse.Namespace, jobs: int) -> list[Record]:

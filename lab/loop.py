@@ -6,12 +6,13 @@ Time line, blocks of one length::
     the ``ahead`` blocks before it are under way.
 
 Rehearsals, scenarios, the demonstration and the soak of one process run by it. Nothing depends on a clock: the same
-seeds give the same run.
+seeds give the same run. `stepped` is the loop of a controller that is asked sample by sample, with readings of an age.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -62,6 +63,42 @@ class Asker:
         else:
             self._memory = answer.memory
         return answer
+
+
+class Controller(Protocol):
+    """What gives the voltages of a stage, sample by sample."""
+
+    def read(self, k: int, u_V: float, y_um: float) -> None:
+        """Take the reading of sample ``k``, µm, which got ``u_V``, V."""
+        ...
+
+    def voltage(self, k: int) -> float:
+        """The voltage of sample ``k``, V."""
+        ...
+
+
+class Stepped(NamedTuple):
+    """(n,) true positions and readings, µm, and voltages, V."""
+
+    true_um: FloatArray
+    read_um: FloatArray
+    u_V: FloatArray
+
+
+def stepped(
+    controller: Controller, n: int, age: int, stage: Callable[[int, FloatArray], tuple[float, float]]
+) -> Stepped:
+    """The loop over n samples, with readings that come ``age`` samples late, at least 1.
+
+    stage : (true position, reading), µm, of a sample by its number and (1,) voltage, V.
+    """
+    true_um, read_um, u_V = np.zeros(n), np.zeros(n), np.zeros(n)
+    for k in range(n):
+        if k >= age:
+            controller.read(k - age, u_V.item(k - age), read_um.item(k - age))
+        u_V[k] = controller.voltage(k)
+        true_um[k], read_um[k] = stage(k, u_V[k : k + 1])
+    return Stepped(true_um, read_um, u_V)
 
 
 class Twins:

@@ -123,6 +123,7 @@ def _run_mirror(args: argparse.Namespace) -> int:
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
+    from dehyst.lab.demo.raster import told
     from dehyst.lab.demo.result import clock_missed, pace, table
 
     samples, ticks = summary["samples"], summary["ticks"]
@@ -130,6 +131,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         "summary.json": "the numbers above, for programs",
         "tracking.png": "reference and errors over time",
         "loops.png": "what each model leaves of the hysteresis",
+        "raster.png": "the error of lines of a raster, with and without repetition",
         "demo.rrd": f"the whole run; open it with: rerun {out / 'demo.rrd'}",
         "recording/": f"the samples in Parquet; learn from them with: dehyst identify {out / 'recording'} --out m.npz",
         "identification/": "the recording that the models were identified from, and model.npz beside it",
@@ -141,6 +143,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         f"the stage changed at t = {summary['change']['t_s']:g} s: {summary['change']['text']}",
         f"samples: {samples['sent']} sent, {samples['received']} received, {samples['learnt']} learnt from",
         _controlled(summary),
+        told(summary["raster"]),
         f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
         f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
         *filter(None, [pace(summary), clock_missed(ticks)]),

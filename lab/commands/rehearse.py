@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, seed={"help": "seed of the reference and of the events (%(default)s)"})
     add("--settle", type=float, default=4.0, metavar="S", help="closed loop before the event, s (4)")
     add("--after", type=float, default=5.0, metavar="S", help="closed loop after the event, s (5)")
+    add("--controllers", type=_ages, default=(), metavar="1,5,20",
+        help="also other controllers, and the corrections, with readings so many samples old (none)")  # fmt: skip
+    add("--mode-hz", type=float, default=100.0, metavar="HZ",
+        help="lowest frequency at which the stage rings, for them, Hz (%(default)g)")  # fmt: skip
     add_shared(
         parser,
         "no-pictures",
@@ -50,6 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _ages(text: str) -> tuple[int, ...]:
+    """Numbers of samples, with commas between them."""
+    return tuple(int(part) for part in text.split(","))
+
+
 def run(args: argparse.Namespace) -> int:
     """Load, identify, run, draw. Returns 0 if no run failed, else 1."""
     from dehyst.lab.rehearsal import (
@@ -57,11 +67,14 @@ def run(args: argparse.Namespace) -> int:
         EVENT_KINDS,
         STANDARD,
         RehearsalConfig,
+        controllers,
         factory_of,
         rehearse,
         standard_events,
     )
+    from dehyst.lab.rehearsal.plant import excitation_range
     from dehyst.lab.rehearsal.rehearsal import remarks, table
+    from dehyst.service.reports.tables import json_form
     from dehyst.service.storage.output import clear_output
 
     if args.events == "list":
@@ -72,6 +85,10 @@ def run(args: argparse.Namespace) -> int:
     check_seed(args.seed)
     if args.rate is not None and not (math.isfinite(args.rate) and args.rate > 0.0):
         raise FieldError("--rate", args.rate, "samples a second, above 0 Hz")
+    if any(age < 1 for age in args.controllers):
+        raise FieldError("--controllers", min(args.controllers), "ages of readings, 1 sample or more")
+    if not 0.0 < args.mode_hz < math.inf:
+        raise FieldError("--mode-hz", args.mode_hz, "a frequency, Hz")
     stop = StopSignal(raising=True)
     config = RehearsalConfig(settle_s=args.settle, after_s=args.after)
     names = args.events.split(",") if args.events else STANDARD
@@ -80,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
     factory = factory_of(given, 1.0 / args.rate if args.rate else None, args.u_min, args.u_max)
     clear_output(args.out, OURS)
     begin = time.perf_counter()
+    total = len(events) + len(args.controllers) * len(controllers.REPEATING)
     said: list[str] = []
     show = progress_printer(args.quiet)
 
@@ -88,14 +106,25 @@ def run(args: argparse.Namespace) -> int:
         # One line where an event begins, with its number in the list.
         if not said or said[-1] != what:
             said.append(what)
-            number = f"[{len(said) - 1}/{len(events)}] " if len(said) > 1 else ""
+            number = f"[{len(said) - 1}/{total}] " if len(said) > 1 else ""
             show(f"{number}{what} ...")
 
     done = rehearse(factory, config=config, events=events, seed=args.seed, progress=progress)
-    summary: dict[str, Any] = done.as_dict() | {"plant": args.plant, "seconds": round(time.perf_counter() - begin, 2)}
+    low_V, _ = excitation_range(factory(), config)
+    compared = controllers.compare(factory, done.identified, low_V, args.mode_hz, args.controllers, args.seed, progress)
+    summary: dict[str, Any] = done.as_dict() | {
+        "controllers": json_form([asdict(one) for one in compared]),
+        "plant": args.plant,
+        "seconds": round(time.perf_counter() - begin, 2),
+    }
+
+    def made(markdown: bool = False) -> list[str]:
+        rows = [controllers.table(compared, markdown)] if compared else []
+        return [table(done, markdown), *rows]
+
     try:
         (args.out / "rehearsal.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-        (args.out / "rehearsal.md").write_text(table(done, markdown=True) + "\n", encoding="utf-8")
+        (args.out / "rehearsal.md").write_text("\n\n".join(made(markdown=True)) + "\n", encoding="utf-8")
         if not args.no_pictures:
             from dehyst.lab.rehearsal.rehearsal import draw_rehearsal
 
@@ -105,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(summary))
     else:
-        print(table(done))
+        print("\n\n".join(made()))
         show(f"done in {summary['seconds']:.0f} s; in {args.out}/: {', '.join(OURS)}")
     return 1 if any(failed(remarks(entry.outcome)) for entry in done.runs) else 0
 

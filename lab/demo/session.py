@@ -27,6 +27,7 @@ from dehyst.lab.demo.plan import (
     make_plan,
     plan_for,
 )
+from dehyst.lab.demo.raster import ALONE, REPETITION, draw_raster, run_raster
 from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking
 from dehyst.lab.loop import Twins, samples, turns
 from dehyst.lab.testbed.identified_stage import READY_S, Rig, write_service_config
@@ -284,7 +285,17 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
 
 Say = Callable[[str], None]
 #: Files and folders of a run. Those of an older run are removed first; other files stay.
-OURS = ("summary.json", "tracking.png", "loops.png", "demo.rrd", "recording", "identification", "model.npz", "logs")
+OURS = (
+    "summary.json",
+    "tracking.png",
+    "loops.png",
+    "raster.png",
+    "demo.rrd",
+    "recording",
+    "identification",
+    "model.npz",
+    "logs",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,12 +354,14 @@ def run(
         write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
     else:
         done = run_live(plan, config, rig, out / "demo.rrd", view, progress)
-    say("[4/4] drawing")
+    say("[4/4] a raster on a rested stage, and the pictures")
+    raster = run_raster(plan, {way: load_axis(STAGE, read_config(config).axes[0]) for way in (ALONE, REPETITION)})
     wanted_um = plan.reference()[0]
-    summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time"}
+    summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time", "raster": raster.summary()}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     draw_tracking(out / "tracking.png", plan, wanted_um, done.y_um)
     draw_loops(out / "loops.png", plan, wanted_um, done.y_um)
+    draw_raster(out / "raster.png", plan, raster)
     return Done(plan, done, summary)
 
 

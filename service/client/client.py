@@ -30,8 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 from dehyst.adaptive.errors import DehystError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.answers.answering import derivatives
+from dehyst.service.answers.correcting import Correcting
 from dehyst.service.answers.guard import Limits, guard, limit_voltage
-from dehyst.service.client.correcting import Correcting
 from dehyst.service.client.follower import Follower
 from dehyst.service.protocol.errors import (
     BehindError,

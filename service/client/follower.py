@@ -23,10 +23,10 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.service.answers.answering import begin_from, derivatives
+from dehyst.service.answers.correcting import Answer, Correcting, Motion
 from dehyst.service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
 from dehyst.service.answers.which_model import Answering, answering, seen_in, trust_by_age
-from dehyst.service.client.correcting import Answer, Correcting, Motion
 from dehyst.service.protocol.delta import checksum, decode_delta, moved
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.model import ModelMessage, decode_model

@@ -18,11 +18,12 @@ _FADE = Setting(help="time over which a correction without good readings is let 
 
 @dataclass(frozen=True, slots=True)
 class CorrectionConfig:
-    """When a follower corrects its voltages by fresh readings, see docs/correction.md."""
+    """When voltages are corrected by fresh readings, see docs/correction.md."""
 
-    on: Annotated[bool, Setting(help="true: followers correct their voltages by the readings that they are given")] = (
-        False
-    )
+    on: Annotated[
+        bool,
+        Setting(help="true: followers correct by the readings that they are given, answers to queries by the samples"),
+    ] = False
     share: Annotated[
         float, Setting(help="largest correction as a share of the voltage range", low=0, above=True, high=1)
     ] = 0.02

@@ -31,7 +31,7 @@ _LIMITS = limits_setting(
 _LEARNER = Setting(help="settings of the learner, see docs/learner.md")
 _COMPETITION = Setting(help="how models are compared and exchanged, see docs/learner.md")
 _RETUNING = Setting(help="background tuning of hyper-parameters, see docs/learner.md")
-_CORRECTION = Setting(help="correction of followers by fresh readings, see docs/correction.md")
+_CORRECTION = Setting(help="correction by fresh readings, see docs/correction.md")
 _REPETITION = Setting(help="correction of motion that repeats, see docs/correction.md")
 _DIAGNOSIS = Setting(help="background diagnosis, see docs/diagnosis.md")
 

@@ -196,6 +196,7 @@ NOT_FINITE_REPLACED: Final = 8
 BLENDED: Final = 16
 STAND_IN: Final = 32
 STALE: Final = 64
+CORRECTED: Final = 128
 FLAG_NAMES: Final = {
     LIMITED_VOLTAGE: "limited_voltage",
     LIMITED_SLEW: "limited_slew",
@@ -204,6 +205,7 @@ FLAG_NAMES: Final = {
     BLENDED: "blended",
     STAND_IN: "stand_in",
     STALE: "stale",
+    CORRECTED: "corrected",
 }
 
 #: Options of a reply: the learner has not yet handled all samples that ``as_of`` covers, so that the same query may get
@@ -232,7 +234,8 @@ class Answer(NamedTuple, Generic[Voltage, Flag]):
     ----------
     u_V : voltage, V; finite and within the limits.
     std_V : one standard deviation, V; NaN if the model does not state it.
-    flags : bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE.
+    flags : bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE,
+        CORRECTED.
     memory : (m,) hysteresis memory after the last point, for the next query.
     snapshot_seq : number of the last sample that the answering snapshot has seen; -1 before any.
     model : name of the model that was asked.

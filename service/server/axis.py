@@ -24,6 +24,7 @@ from dehyst.adaptive.state import Entry, Refused, load, part_of, restore, save
 from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
 from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
+from dehyst.service.answers.correcting import QueryCorrection
 from dehyst.service.answers.guard import Limits
 from dehyst.service.answers.slices import Pace
 from dehyst.service.answers.which_model import (
@@ -45,6 +46,7 @@ from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.learner_supervisor import (
     NOT_COMMANDED,
     NOT_LEARNING,
+    NOT_REFUSED,
     UNUSABLE,
     LearnerSupervisor,
     Revive,
@@ -241,6 +243,10 @@ class Axis:
         self.supervisor = LearnerSupervisor(
             config.learn, learner, limits, config.last_good_s, self.dt_s, self.note, revive
         )
+        #: What is added to the answers to queries; None: nothing.
+        self.correction = (
+            QueryCorrection(config.correction, limits, self.dt_s, self._note_limited) if config.correction.on else None
+        )
         #: What moves between two snapshots, for followers.
         self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.
@@ -347,11 +353,17 @@ class Axis:
         ``pace`` : evaluate in slices, all from one snapshot, with this between them (`service.answers.slices`).
         """
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
-        got = answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
-        if query.pending is not None:
-            self.witness.note(query.pending, query.y_um, got.u_V)
-            if self._age_s is not None:
-                self._look_ahead(query.pending.first, most_ahead(handled, self._age_s, self.dt_s))
+        ring = self._snapshots
+
+        def ask(asked: FeedforwardQuery) -> Trajectory:
+            return answer(asked, ring, handled, self.config, self.limits, self._age_s, pace)
+
+        if query.pending is None:
+            return ask(query)
+        got = ask(query) if self.correction is None else self.correction.answer(query, ask, ring, handled)
+        self.witness.note(query.pending, query.y_um, got.u_V)
+        if self._age_s is not None:
+            self._look_ahead(query.pending.first, most_ahead(handled, self._age_s, self.dt_s))
         return got
 
     def _look_ahead(self, first: int, most: int) -> None:
@@ -430,6 +442,8 @@ class Axis:
             self.supervisor.watch.take(u_V, y_um, verdict)
             if verdict not in UNUSABLE:
                 self.tracker.add(seq, u_V, y_um)
+            if self.correction is not None:
+                self.correction.read(seq, u_V, y_um if verdict in NOT_REFUSED else math.nan)
             due = seq // every > self.newest.seq // every
             if due:
                 self._take_snapshot(seq, t_s, u_V)
@@ -495,6 +509,8 @@ class Axis:
     def _begin_count(self, order: str, seq: int, before: int) -> None:
         """The stage has begun another count: its number after ``before`` is ``seq``."""
         self.tracker.forget()
+        if self.correction is not None:
+            self.correction.forget()
         if order == RESTARTED:
             # Snapshots of the old count can no longer be named.
             self._snapshots = (replace(self.newest, seq=-1),)

@@ -65,7 +65,7 @@ NOT_LEARNING: Final = "not_learning"
 #: Verdict on samples of which neither voltage nor reading is believed.
 NOT_COMMANDED: Final = "not_commanded"
 #: Verdicts that are no refusal of a sample in motion.
-_NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
+NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
 #: What lets the learner follow such a change.
 _WIDEN: Final = {
     OUT_OF_ENVELOPE: "if it is real, identify again, or widen learner.envelope.gain or learner.envelope.offset",
@@ -121,7 +121,7 @@ class SampleWatch:
         self._still.take(y_um == self._y_um, u_V)
         self._y_um = y_um
         if verdict != GAP:
-            self._silent.take(verdict not in _NOT_REFUSED, u_V)
+            self._silent.take(verdict not in NOT_REFUSED, u_V)
             self._gate = verdict
         # A repeated reading belongs to the trouble sensor_frozen.
         bad = 1.0 if verdict in _BAD_VALUES and not self._still.count else 0.0

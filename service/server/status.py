@@ -57,6 +57,7 @@ def axis_fields(loop: AxisLoop, stale: bool = False, losses: str = "") -> dict[s
         "delta_hz": axis.config.delta_hz,
         "correction": asdict(axis.config.correction) if axis.config.correction.on else None,
         "repetition": asdict(axis.config.repetition) if axis.config.repetition.on else None,
+        "corrected": None if axis.correction is None else axis.correction.status(),
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
             **counts.samples,

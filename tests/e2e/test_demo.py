@@ -81,7 +81,8 @@ def test_real_time_demo_leaves_everything_it_promises(live: tuple[Path, str]) ->
     assert found["samples"]["learnt"] > 100
     assert "LSSVM with memory, adaptive" in told
     assert "rerun" in told
-    for picture in ("tracking.png", "loops.png"):
+    assert "raster of 20 lines/s" in told
+    for picture in ("tracking.png", "loops.png", "raster.png"):
         assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (out / "demo.rrd").stat().st_size > 100_000
     rows = pq.read_table(out / "recording").num_rows  # type: ignore[no-untyped-call]
@@ -101,6 +102,19 @@ def test_adaptive_is_caught_again_and_better_than_all_frozen_ones(fast: Path) ->
     assert adaptive["first_second"]["mae_pct"] <= 0.20
     # The short run leaves 3 s to settle; the full one has to reach 0.06 (see the README's table).
     assert adaptive["settled"]["mae_pct"] < 0.15
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.alone
+def test_repetition_improves_the_lines_of_the_raster(fast: Path) -> None:
+    raster = summary(fast)["raster"]
+    alone, repeated = raster["mae_pct"]["learning model"], raster["mae_pct"]["with repetition"]
+    assert raster["lines_per_s"] == 20.0
+    assert len(alone) == len(repeated) == 20
+    assert repeated[0] < 1.1 * alone[0]  # nothing is known yet
+    assert max(repeated[9:]) < 0.85 * min(alone[9:])
+    assert repeated[19] < 0.5 * repeated[0]
 
 
 @pytest.mark.e2e

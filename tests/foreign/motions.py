@@ -22,14 +22,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.lab.rehearsal.reference import Motion, Reference, ReferenceRequest, SmoothStep, product
+from dehyst.lab.rehearsal.reference import (
+    BEGIN_S,
+    Motion,
+    Placed,
+    Reference,
+    ReferenceRequest,
+    Sawtooth,
+    Shape,
+    SmoothStep,
+    product,
+)
 
 FloatArray = NDArray[np.float64]
-#: A motion within 0 to 1 as a function of the time since it began, s.
-Shape = Callable[[FloatArray], Motion]
-
-#: Rest at first, end of the slow move to the place where the motion begins, and begin of the motion, s.
-REST_S, THERE_S, BEGIN_S = 0.15, 0.95, 1.0
 #: When a hold may begin at the earliest, and when the stand of a night begins, s.
 HOLD_FROM_S, NIGHT_FROM_S = 4.0, 0.1
 #: Tones of the band-limited noise, and their lowest frequency as a share of the highest.
@@ -39,22 +44,6 @@ FADE_S = 0.3
 
 
 # ---- shapes
-
-
-@dataclass(frozen=True, slots=True)
-class Sawtooth:
-    """Up at one speed and back at another one within the share ``back`` of the period; a triangle with 0.5."""
-
-    frequency_Hz: float
-    back: float = 0.5
-
-    def __call__(self, t_s: FloatArray) -> Motion:
-        phase = np.mod(self.frequency_Hz * t_s, 1.0)
-        forth = 1.0 - self.back
-        up = phase < forth
-        y = np.where(up, phase / forth, (1.0 - phase) / self.back)
-        v = self.frequency_Hz * np.where(up, 1.0 / forth, -1.0 / self.back)
-        return Motion(y, v, np.zeros_like(y))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,29 +122,6 @@ class Spiral:
 
 
 # ---- references
-
-
-@dataclass(frozen=True, slots=True)
-class Placed:
-    """A shape between two places, µm, after a rest at ``start_um`` and a slow move to its begin."""
-
-    shape: Shape
-    start_um: float
-    low_um: float
-    span_um: float
-
-    def __call__(self, t_s: FloatArray) -> Motion:
-        t = np.asarray(t_s, dtype=np.float64)
-        moves = t >= BEGIN_S
-        first_um = self.low_um + self.span_um * self.shape(np.zeros(1)).y_um[0]
-        shape = self.shape(np.maximum(t - BEGIN_S, 0.0))
-        way = SmoothStep(REST_S, THERE_S)(t)
-        way_um = first_um - self.start_um
-        return Motion(
-            np.where(moves, self.low_um + self.span_um * shape.y_um, self.start_um + way_um * way.y_um),
-            np.where(moves, self.span_um * shape.v_um_per_s, way_um * way.v_um_per_s),
-            np.where(moves, self.span_um * shape.a_um_per_s2, way_um * way.a_um_per_s2),
-        )
 
 
 @dataclass(frozen=True, slots=True)

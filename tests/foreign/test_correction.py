@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.correction import Course, figures, follow
+from benchmarks.correction import course_of, figures, follow
 
 
 @pytest.mark.slow
 def test_the_model_takes_over_what_the_correction_carries_and_both_are_better_than_either() -> None:
     """A stage of plays that rings, readings one sample old, and a gain that changes by 6 % at 4 s."""
-    course = Course.of(3)
+    course = course_of(3)
     alone, both, rival = (figures(course, follow(course, way, 1, "gain")) for way in ("alone", "corrected", "frozen+I"))
     assert both["before"] <= alone["before"]
     assert both["after"] <= alone["after"]

@@ -7,17 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dehyst.lab.rehearsal.reference import Motion, ReferenceRequest
+from dehyst.lab.rehearsal.reference import BEGIN_S, REST_S, Motion, ReferenceRequest, Sawtooth
 from dehyst.lab.rehearsal.runs import times
 from tests.foreign.motions import (
-    BEGIN_S,
     MOTIONS,
     NIGHT_FROM_S,
-    REST_S,
     Levels,
     MotionMaker,
     Rounded,
-    Sawtooth,
     Spiral,
     motion,
 )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dehyst.lab.loop import Asker, Twins, samples, turns
+from dehyst.lab.loop import Asker, Twins, samples, stepped, turns
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.server.axis import Axis
@@ -35,6 +35,28 @@ def test_a_block_is_asked_for_when_those_before_the_blocks_under_way_have_run(bl
             assert run == list(range(max(0, due - ahead)))
             asked.append(due)
     assert run == asked == list(range(blocks))
+
+
+@pytest.mark.parametrize("age", [1, 3])
+def test_step_by_step_a_reading_comes_so_many_samples_late(age: int) -> None:
+    told: list[tuple[int, float, float, int]] = []
+
+    class Noting:
+        at = -1
+
+        def read(self, k: int, u_V: float, y_um: float) -> None:
+            told.append((k, u_V, y_um, self.at))
+
+        def voltage(self, k: int) -> float:
+            self.at = k
+            return float(k)
+
+    got = stepped(Noting(), 6, age, lambda k, u_V: (10.0 * u_V.item(), 10.0 * u_V.item() + 1.0))
+    # Before voltage k comes the reading of sample k - age, with the voltage that it got.
+    assert told == [(k - age, k - age, 10.0 * (k - age) + 1.0, k - 1) for k in range(age, 6)]
+    assert got.u_V.tolist() == list(range(6))
+    assert got.true_um.tolist() == [10.0 * k for k in range(6)]
+    assert got.read_um.tolist() == [10.0 * k + 1.0 for k in range(6)]
 
 
 def an_axis() -> Axis:

@@ -26,8 +26,8 @@ from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.baselines.linear import LinearInverse, LinearParameters
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from dehyst.service.answers.answering import Served, answer, blends, learns
+from dehyst.service.answers.correcting import Correcting
 from dehyst.service.answers.guard import Limits, limit_voltage
-from dehyst.service.client.correcting import Correcting
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet

@@ -32,7 +32,8 @@ enum {
     DEHYST_NOT_FINITE_REPLACED = 8,
     DEHYST_BLENDED = 16,
     DEHYST_STAND_IN = 32,
-    DEHYST_STALE = 64
+    DEHYST_STALE = 64,
+    DEHYST_CORRECTED = 128
 };
 
 typedef struct {

@@ -11,6 +11,7 @@ pub const NOT_FINITE_REPLACED: u8 = 8;
 pub const BLENDED: u8 = 16;
 pub const STAND_IN: u8 = 32;
 pub const STALE: u8 = 64;
+pub const CORRECTED: u8 = 128;
 
 /// Limits of one axis, as the status of the service has them; infinite where there is none.
 #[derive(Clone, Copy, Debug, PartialEq)]

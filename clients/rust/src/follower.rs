@@ -438,6 +438,7 @@ pub fn flag_names(flags: u8) -> Vec<&'static str> {
         (BLENDED, "blended"),
         (answer::STAND_IN, "stand_in"),
         (STALE, "stale"),
+        (answer::CORRECTED, "corrected"),
     ];
     names.iter().filter(|(bit, _)| flags & bit != 0).map(|(_, name)| *name).collect()
 }

@@ -92,6 +92,8 @@ def test_table_json_and_picture_of_a_plant(plant: Path, tmp_path: Path, capsys: 
         ("mine.py:Stage", ("--events", "thunder"), "some of none"),
         ("mine.py:Stage", ("--seed", "-1"), "--seed"),
         ("mine.py:Stage", ("--settle", "0"), "at least 2 s before"),
+        ("mine.py:Stage", ("--controllers", "0,5"), "--controllers"),
+        ("mine.py:Stage", ("--mode-hz", "0"), "--mode-hz"),
         ("broken.py:Stage", (), "ZeroDivisionError"),
     ],
 )

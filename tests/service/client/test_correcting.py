@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dehyst.service.answers.correcting import Correcting
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client
-from dehyst.service.client.correcting import Correcting
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.protocol.errors import FieldError
@@ -397,3 +397,21 @@ def test_a_real_service_switches_the_repetition_on_while_it_learns(client: Clien
     assert repetition.period == pytest.approx(PERIOD, abs=0.01)
     assert error_um[-200:].mean() < 0.05
     assert error_um[-200:].mean() < 0.3 * error_um[:134].mean()
+
+
+def test_a_block_lets_go_as_many_samples_as_it_has() -> None:
+    one = follower()
+    drive(one, 300)
+    assert one.correcting is not None
+    assert one.correcting.integral_V
+    one.correcting.on = False
+    y = wanted(500)
+    for first in range(300, 400, 20):  # fade_s is 100 samples
+        one.trajectory(y[first : first + 20], seq=first)
+    assert one.correcting.integral_V == 0.0
+    again = follower()
+    drive(again, 300)
+    assert again.correcting is not None
+    for first in range(300, 510, 30):  # twice fade_s: no reading, then let go
+        again.trajectory(wanted(540)[first : first + 30], seq=first)
+    assert again.correcting.integral_V == 0.0

@@ -1,12 +1,16 @@
-"""The corrections of a follower: pair the readings with what was asked for, by the numbers of their samples."""
+"""The corrections: pair the readings with what was asked for, by the numbers of their samples.
+
+A follower has a `Correcting` of its own; `QueryCorrection` is that of the answers to queries.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+import threading
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from dehyst.adaptive.correction.integral import Correction, sensitivity
 from dehyst.adaptive.correction.repetition import Repetition
 from dehyst.adaptive.types import FloatArray, InverseModel
-from dehyst.service.answers.guard import Limits
+from dehyst.service.answers.answering import Served
+from dehyst.service.answers.guard import Limits, guard
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.config.schema import build_settings, keys_of
+from dehyst.service.intake.command_witness import DIFFERS_FROM, LEAST_TOLERANCE, TOLERANCE
 from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.query import CORRECTED, NEWEST, OUTSIDE_DOMAIN, STALE, FeedforwardQuery, Trajectory
 from dehyst.service.protocol.samples import column, sequence
 
 _LOGGER: Final = logging.getLogger("dehyst.client")
@@ -37,7 +44,7 @@ _AGE_KEPT: Final = 1000
 
 
 class Correcting:
-    """What a follower adds to its voltages. Raises FieldError where the axis has no displacement range.
+    """What is added to the voltages of one controller. Raises FieldError where the axis has no displacement range.
 
     Attributes
     ----------
@@ -113,16 +120,14 @@ class Correcting:
         self._wanted_um[numbers % _KEPT] = points[0][-_KEPT:]
         point = points[0][:1], points[1][:1], points[2][:1]
         before, self._model = self._model, model
-        if before is not None and before is not model and self._integral_V and before.memory_size == memory.size:
+        if before is not None and before is not model and self.integral_V and before.memory_size == memory.size:
             changed_V = model.feedforward(*point, memory).u_V.item(0) - before.feedforward(*point, memory).u_V.item(0)
             if math.isfinite(changed_V) and self.correction is not None:
                 self.correction.hand_over(changed_V)
         u_V, std_V = answer
         if self.trouble or not self.on:
             self._readings.clear()
-            for each in self._each.values():
-                each.release()
-            return np.full(n, sum(each.u_V for each in self._each.values()))
+            return np.array([self._released() for _ in range(n)])
         if self._readings:
             self._look_at_age(first + n - 1 - self._readings[0][0])
             if self._slope_held == 0:
@@ -130,11 +135,18 @@ class Correcting:
             self._slope_held = (self._slope_held + 1) % self._slope_every
             self._take(first + n - 1, std_V)
         elif self.correction is not None:
-            self.correction.wait()
-        added_V = np.full(n, self._integral_V)
+            for _ in range(n):
+                self.correction.wait()
+        added_V = np.full(n, self.integral_V)
         if self.repetition is not None:
             added_V += [self.repetition.add(first + k, points[0].item(k), u_V.item(k)) for k in range(n)]
         return added_V
+
+    def _released(self) -> float:
+        """What is left, V, one sample later."""
+        for each in self._each.values():
+            each.release()
+        return sum(each.u_V for each in self._each.values())
 
     def _take(self, last: int, std_V: float) -> None:
         """Use the readings that have come; ``last`` : sample of the last voltage that they can change."""
@@ -161,11 +173,12 @@ class Correcting:
     def applied(self, first: int, u_V: FloatArray) -> None:
         """Take the (n,) voltages, V, that the points from sample ``first`` on got in the end."""
         if self.repetition is not None:
-            for k, value in enumerate((u_V - self._integral_V).tolist()):
+            for k, value in enumerate((u_V - self.integral_V).tolist()):
                 self.repetition.applied(first + k, value)
 
     @property
-    def _integral_V(self) -> float:
+    def integral_V(self) -> float:
+        """The correction by the integral, V."""
         return 0.0 if self.correction is None else self.correction.u_V
 
     def begin(self, u_V: float, std_V: float) -> None:
@@ -200,3 +213,146 @@ def _said(kind: type[_Config], status: Mapping[str, Any], name: str) -> _Config 
     known = {key.name for key in keys_of(kind)}  # a newer service may say more
     table = {key: value for key, value in dict(said).items() if key in known}
     return build_settings(kind, table, f"status.{name}")
+
+
+class _Read(NamedTuple):
+    """A sample: its number, voltage, V, and reading, µm; NaN for a reading that is doubted."""
+
+    seq: int
+    u_V: float
+    y_um: float
+
+
+class QueryCorrection:
+    """The correction of an axis' answers to queries that name what is under way.
+
+    The readings are those of the samples. One controller is corrected: its queries go on from the answers before, and
+    the samples show the voltages of these. Queries that compare are answered as without, and so is a controller that
+    adds something of its own, as a follower with readings does. Another one begins, at zero, when the stage has passed
+    the last answer. ``note`` : takes the name of an event and its detail.
+
+    Any thread may call `answer`; `read` and `forget` are for the one that handles samples. Raises FieldError where the
+    axis has no displacement range.
+    """
+
+    def __init__(self, config: CorrectionConfig, limits: Limits, dt_s: float, note: Callable[[str, str], None]) -> None:
+        self._made = config, limits, dt_s
+        self._limits, self._note = limits, note
+        span_V = limits.u_max_V - limits.u_min_V
+        self._own_V, self._shown_V = LEAST_TOLERANCE * span_V, TOLERANCE * span_V
+        self._lock = threading.Lock()
+        self._samples: deque[_Read] = deque(maxlen=_KEPT)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Correct nobody: from zero."""
+        self._correcting = Correcting(*self._made)
+        # By the number of the sample: what was answered for it, and how much of that is the correction, V.
+        self._numbers = np.full(_KEPT, -1, dtype=np.int64)
+        self._answered_V, self._added_V = np.zeros(_KEPT), np.zeros(_KEPT)
+        self._end = -1
+        self._differ = 0
+
+    def read(self, seq: int, u_V: float, y_um: float) -> None:
+        """Take a sample: its voltage, V, and its reading, µm; NaN for one that is not to be believed."""
+        self._samples.append(_Read(seq, u_V, y_um))
+
+    def forget(self) -> None:
+        """The stage has begun another count."""
+        with self._lock:
+            self._samples.clear()
+            self._begin()
+
+    def answer(
+        self, query: FeedforwardQuery, ask: Callable[[FeedforwardQuery], Trajectory], ring: Sequence[Served], seen: int
+    ) -> Trajectory:
+        """The answer of ``ask`` to ``query``, which has samples under way, with the correction.
+
+        ring : snapshots that ``ask`` answers from. seen : number of the last sample that was handled.
+        """
+        assert query.pending is not None
+        first, way_V = query.pending.first + query.pending.u_V.size, query.pending.u_V.copy()
+        with self._lock:
+            self._take(seen if query.as_of == NEWEST else query.as_of)
+            before_V = self._before(first, way_V.item(-1), seen)
+        if before_V is None:
+            return ask(query)
+        # The correction is no part of what the models say: what fades at the beginning is the rest.
+        way_V[-1] -= before_V
+        pending = query.pending._replace(u_V=way_V)
+        got = ask(query._replace(pending=pending, u_before_V=query.u_before_V - before_V))
+        # A snapshot has seen all that it will see; the correction has not before the last reading has come.
+        got = got._replace(behind=got.behind or seen < query.as_of)
+        served = next(one for one in reversed(ring) if one.seq == got.snapshot_seq)
+        with self._lock:
+            return self._added(query, got, served, first)
+
+    def _added(self, query: FeedforwardQuery, got: Trajectory, served: Served, first: int) -> Trajectory:
+        """The answer ``got``, whose first point is for sample ``first``, with the correction."""
+        model, trouble = served.models[got.model], served.trouble or ("stale" if got.flags[-1] & STALE else "")
+        points = query.y_um, query.v_um_per_s, query.a_um_per_s2
+        answer = got.u_V, got.std_V.item(0)
+        if got.behind:  # asked again later: time has not gone on
+            added_V = np.full(got.u_V.size, self._correcting.integral_V)
+        else:
+            added_V = self._correcting.voltage(first, model, points, served.memories[got.model], answer, trouble)
+        inside = (got.flags & OUTSIDE_DOMAIN) == 0
+        u_V, flags = guard(got.u_V + added_V, inside, model.dt_s, self._limits, query.u_before_V)
+        flags |= got.flags
+        self._correcting.leave_out(first, flags)
+        self._end = first + u_V.size
+        numbers = np.arange(first, self._end)[-_KEPT:]
+        at = numbers % _KEPT
+        self._numbers[at], self._answered_V[at], self._added_V[at] = numbers, u_V[-_KEPT:], added_V[-_KEPT:]
+        flags[added_V != 0.0] |= CORRECTED
+        return got._replace(u_V=u_V, flags=flags)
+
+    def _before(self, first: int, last_V: float, seen: int) -> float | None:
+        """The correction, V, in ``last_V``, which is under way before sample ``first``; None for who is not corrected.
+
+        seen : number of the last sample that was handled.
+        """
+        last = min(first, self._end) - 1  # what was answered last is held
+        if (
+            self._numbers.item(last % _KEPT) == last
+            and abs(last_V - self._answered_V.item(last % _KEPT)) <= self._own_V
+        ):
+            return self._added_V.item(last % _KEPT)
+        if self._end > seen:
+            return None
+        self._begin()
+        self._note("correction_begun", f"of the answers to a controller, from sample {first} on and from zero")
+        return 0.0
+
+    def _take(self, until: int) -> None:
+        """Hand on the samples up to ``until`` whose voltages were answered here."""
+        numbers, readings_um = [], []
+        while self._samples and self._samples[0].seq <= until:
+            seq, u_V, y_um = self._samples.popleft()
+            near = np.arange(seq - 1, seq + 2)
+            near_V = self._answered_V[near[self._numbers[near % _KEPT] == near] % _KEPT]
+            if not near_V.size:
+                continue
+            shown = near_V.min() - self._shown_V <= u_V <= near_V.max() + self._shown_V
+            self._differ = 0 if shown else self._differ + 1
+            numbers.append(seq)
+            readings_um.append(y_um if shown else math.nan)
+        if self._differ >= DIFFERS_FROM:
+            self._begin()
+        elif numbers:
+            self._correcting.read(numbers, readings_um)
+
+    def status(self) -> dict[str, Any]:
+        """``state`` in words, size ``u_V``, V, gain, 1/s, age, samples, and counts, as JSON values; for any thread."""
+        correcting = self._correcting
+        correction = correcting.correction
+        assert correction is not None
+        let_go = f"let go: {correcting.trouble}" if correcting.trouble else "corrects"
+        return {
+            "state": let_go if self._end >= 0 else "nobody is corrected",
+            "u_V": correction.u_V,
+            "gain_per_s": correction.factor * correction.loop.gain_per_s,
+            "age": correcting.age,
+            "halved": correction.halved,
+            "doubted": correction.doubted,
+        }
