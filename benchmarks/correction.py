@@ -18,14 +18,14 @@ import json
 import math
 import sys
 import time
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from benchmarks.records import Record, recorded
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.rehearsal import RehearsalConfig, identify
 from dehyst.lab.rehearsal.controllers import COUNT_S, EVENT_S, SECONDS, SHOWN, Course, line_errors_pct
@@ -34,8 +34,6 @@ from dehyst.lab.rehearsal.reference import Motion
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import motion
 from tests.foreign.plants import random_plant
-
-Record = dict[str, Any]
 
 #: Controllers, see `lab.rehearsal.controllers`.
 WAYS: Final = ("alone", "corrected", "frozen+I", "frozen", "I")
@@ -151,10 +149,9 @@ def run_one(
         "seed": course.seed, "case": case, "way": way, "age": age, "hysteresis": course.name,
         "dt_s": course.known.dt_s,
     }  # fmt: skip
-    try:
-        return record | measure(course, follow(course, way, age, case))
-    except Exception:
-        return record | {"failed": traceback.format_exc()}
+    with recorded(record):
+        record |= measure(course, follow(course, way, age, case))
+    return record
 
 
 def run_rasters(course: ForeignCourse, ages: Sequence[int] = AGES, ways: Sequence[str] = RASTER_WAYS) -> list[Record]:

@@ -27,18 +27,17 @@ import multiprocessing
 import os
 import sys
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks import foreign_motions
+from benchmarks.records import Record, recorded
 from dehyst.lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import MOTIONS, motion
@@ -67,7 +66,6 @@ HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
 #: Healthy runs end when so many have failed.
 MOST_FAILED = 10
 
-Record = dict[str, Any]
 #: What makes a record, and the record without results if its process dies.
 Run = tuple[Callable[[], Record], Record]
 
@@ -77,9 +75,9 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
     from dehyst.lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
     from tests.foreign.plants import issue_plant, random_plant
 
-    begin, begin_cpu = time.perf_counter(), time.process_time()
+    begin_cpu = time.process_time()
     record: Record = {"seed": seed, "preset": preset, "class": name}
-    try:
+    with recorded(record):
         factory = issue_plant(seed) if preset == "issue" else random_plant(seed, as_drawn=preset == "as_drawn")
         at_s = SETTLE_S[preset] + float(np.random.default_rng([seed, 22]).uniform(0.0, LATER_S))
         record["stage"] = factory.traits.summary()
@@ -94,9 +92,7 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
         record["identify_s"] = time.process_time() - begin_cpu
         run = run_event(factory, known, config, draw(name, seed, at_s), seed)
         record |= run.outcome.as_dict() | {"range_um": run.range_um, "heldout_mae_pct": known.heldout_mae_pct}
-    except Exception:
-        record["failed"] = traceback.format_exc()
-    return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+    return record
 
 
 def run_healthy_stage(seed: int, block: int) -> Record:
@@ -105,18 +101,15 @@ def run_healthy_stage(seed: int, block: int) -> Record:
     from dehyst.lab.rehearsal import RehearsalConfig, identify, run_healthy
     from tests.foreign.plants import random_plant
 
-    begin, begin_cpu = time.perf_counter(), time.process_time()
     record: Record = {"seed": seed, "class": HEALTHY, "block": block}
-    try:
+    with recorded(record):
         factory = random_plant(seed)
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
         config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block)
         duration_s = float(np.clip(HEALTHY_SAMPLES * factory.traits.dt_s, *HEALTHY_S))
         record |= run_healthy(factory, identify(factory, config), config, duration_s, seed).as_dict()
-    except Exception:
-        record["failed"] = traceback.format_exc()
-    return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+    return record
 
 
 def run_controllers(seed: int, ages: Sequence[int]) -> Record:
@@ -124,15 +117,12 @@ def run_controllers(seed: int, ages: Sequence[int]) -> Record:
     from benchmarks.correction import course_of
     from dehyst.lab.rehearsal import controllers
 
-    begin_cpu = time.process_time()
     record: Record = {"seed": seed, "ages": list(ages)}
-    try:
+    with recorded(record):
         course = course_of(seed)
         found = controllers.compare(course.make, course.known, course.low_V, course.mode_Hz, ages, seed)
         record |= {"hysteresis": course.name, "controllers": [asdict(one) for one in found]}
-    except Exception:
-        record["failed"] = traceback.format_exc()
-    return record | {"cpu_s": time.process_time() - begin_cpu}
+    return record
 
 
 def controllers_table(records: Sequence[Record]) -> str:

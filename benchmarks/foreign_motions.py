@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
-import traceback
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from benchmarks.records import Record, recorded
 from dehyst.service.protocol.query import BLENDED, OUTSIDE_DOMAIN, STAND_IN
 from dehyst.service.reports.tables import json_form, markdown
 from tests.foreign.motions import MOTIONS, motion
 from tests.foreign.plants import Traits, random_plant
-
-Record = dict[str, Any]
 
 #: Recordings to identify from: 10 s of the whole stroke, or 2 s of its lower half. The frequency of both is 3 Hz at
 #: first and falls. After a poor one the motion stays within the half that is known: the axis refuses what is beyond.
@@ -93,9 +90,8 @@ def run_motion(
     from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
     from dehyst.lab.rehearsal.outcome import moving_mean
 
-    begin, begin_cpu = time.perf_counter(), time.process_time()
     record: Record = {"seed": seed, "recording": recording, "motion": name}
-    try:
+    with recorded(record):
         factory = random_plant(seed)
         traits = factory.traits
         dt_s = traits.dt_s
@@ -150,9 +146,7 @@ def run_motion(
                 "ends_at_rail": run.outcome.adaptive.ends_at_rail,
             }
         )
-    except Exception:
-        record["failed"] = traceback.format_exc()
-    return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+    return record
 
 
 # ---- the table
