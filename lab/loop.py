@@ -5,8 +5,8 @@ Time line, blocks of one length::
     block j is asked for when the axis has handled the samples of the blocks up to j - ahead - 1;
     the ``ahead`` blocks before it are under way.
 
-Rehearsals, scenarios, the demonstration and the soak of one process run by it. Nothing depends on a clock: the same
-seeds give the same run. `stepped` is the loop of a controller that is asked sample by sample, with readings of an age.
+Rehearsals, scenarios and the fast demonstration run by it. Nothing depends on a clock: the same seeds give the same
+run. `stepped` is the loop of a controller that is asked sample by sample, with readings of an age.
 """
 
 from __future__ import annotations

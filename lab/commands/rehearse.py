@@ -56,8 +56,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _ages(text: str) -> tuple[int, ...]:
-    """Numbers of samples, with commas between them."""
-    return tuple(int(part) for part in text.split(","))
+    """Numbers of samples, with commas between them. Raises ArgumentTypeError where one is none."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        message = f"got {text!r}, expected ages in samples, with commas between them: 1,5,20"
+        raise argparse.ArgumentTypeError(message) from error
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""The second half of a demonstration: a raster on the same stage, whose lines the service corrects one by the other."""
+"""The second half of a demonstration: a raster on the same stage, each line corrected by what the last one showed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from dehyst.adaptive.types import FloatArray
 from dehyst.lab.demo.plan import Plan
 from dehyst.lab.loop import samples, stepped
-from dehyst.lab.rehearsal.controllers import Following, line_errors_pct, raster_times, triangles
+from dehyst.lab.rehearsal.controllers import Following, line_errors_pct, raster_times, repeating, triangles
 from dehyst.lab.rehearsal.reference import BEGIN_S, Motion, ReferenceRequest
-from dehyst.service.answers.correcting import Correcting
-from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
+from dehyst.lab.rehearsal.runs import IDLE_S
+from dehyst.service.config.correction import CorrectionConfig
 from dehyst.service.reports.plot_style import figure, label, legend, line, save
 from dehyst.service.server.axis import Axis
 from dehyst.service.viewer.colours import ADAPTIVE, FROZEN
@@ -25,8 +25,8 @@ from dehyst.sim.stage.stage import Stage
 LINES_PER_S: Final = 20.0
 #: Lines of the picture.
 SHOWN: Final = (1, 5, 20)
-#: Rest before the motion, s, and age of the readings, samples.
-_IDLE_S, _AGE = 0.2, 1
+#: Age of the readings, samples.
+_AGE: Final = 1
 ALONE, REPETITION = "learning model", "with repetition"
 
 
@@ -54,7 +54,7 @@ def run_raster(plan: Plan, axes: dict[str, Axis]) -> RasterRun:
     """The raster on new stages, unchanged and at rest, each with one of the new ``axes``, by controller."""
     dt_s, config, hertz = plan.dt_s, plan.stage(changing=False), LINES_PER_S / plan.slowness
     t_s = raster_times(hertz, dt_s)
-    rest_V = np.full(round(_IDLE_S / dt_s), plan.drive_low_V)
+    rest_V = np.full(round(IDLE_S / dt_s), plan.drive_low_V)
     true_um: dict[str, FloatArray] = {}
     for way, axis in axes.items():
         stage = Stage(config)
@@ -63,11 +63,7 @@ def run_raster(plan: Plan, axes: dict[str, Axis]) -> RasterRun:
         axis.handle(samples(0, dt_s, rest_V, at_rest_um))
         wish = ReferenceRequest(at_rest_um.item(-1), plan.low_um, plan.high_um, t_s.item(-1), plan.seed)
         wanted = triangles(hertz)(wish)(t_s)
-        correcting = None
-        if way == REPETITION:
-            mode_Hz = _mode_Hz(config)
-            settings = CorrectionConfig(on=True, mode_Hz=mode_Hz), axis.limits, dt_s
-            correcting = Correcting(*settings, RepetitionConfig(on=True, mode_Hz=mode_Hz))
+        correcting = repeating(axis, _mode_Hz(config)) if way == REPETITION else None
         controller = Following(axis, wanted, rest_V.size, correcting, learns=True)
 
         def driven(_: int, u_V: FloatArray, stage: Stage = stage, state: Any = state) -> tuple[float, float]:

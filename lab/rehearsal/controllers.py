@@ -31,7 +31,7 @@ from dehyst.lab.rehearsal.reference import (
     Sawtooth,
 )
 from dehyst.lab.rehearsal.rehearsal import AXIS, STAGE, bundle_of
-from dehyst.lab.rehearsal.runs import times
+from dehyst.lab.rehearsal.runs import IDLE_S, times
 from dehyst.service.answers.correcting import Answer, Correcting
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.follower import Follower
@@ -66,8 +66,6 @@ COUNT_S: Final = 2.0
 LINES, SHOWN = 20, (1, 5, 10, 20)
 RESYNCHRONISE_S: Final = 0.25
 SNAPSHOT_EVERY: Final = 5
-#: Rest before the motion, s.
-_IDLE_S: Final = 0.2
 
 
 class Unbounded(Correcting):
@@ -130,6 +128,12 @@ class Following:
         u_V = self._follower.point(y, v, a, seq=self._first + k)
         self.added_V.append(0.0 if self.correcting is None else self.correcting.integral_V)
         return u_V
+
+
+def repeating(axis: Axis, mode_Hz: float) -> Correcting:
+    """The correction of ``axis`` with the repetition; ``mode_Hz`` : lowest frequency at which the stage rings, Hz."""
+    config, repetition = CorrectionConfig(on=True, mode_Hz=mode_Hz), RepetitionConfig(on=True, mode_Hz=mode_Hz)
+    return Correcting(config, axis.limits, axis.dt_s, repetition)
 
 
 class _Integral:
@@ -273,12 +277,12 @@ class Course:
         go_to_lowest(inner, low_V)
         scale = EventScale(self.range_um, 0.5 * (known.low_um + known.high_um), known.rest_um)
         plant, sensor = DisturbedPlant(inner, event, scale), DisturbedSensor(event, scale, dt_s, n)
-        rest = round(_IDLE_S / dt_s)
+        rest = round(IDLE_S / dt_s)
         rest_V = np.full(rest, low_V)
         axis.handle(samples(1, dt_s, rest_V, plant.run(-rest, rest_V)[1]))
         correcting = None
         if way == "repetition":
-            correcting = Correcting(config, axis.limits, dt_s, RepetitionConfig(on=True, mode_Hz=self.mode_Hz))
+            correcting = repeating(axis, self.mode_Hz)
         elif way in ("corrected", "frozen+I"):
             correcting = (Correcting if way == "corrected" else Unbounded)(config, axis.limits, dt_s)
         following = Following(axis, self.wanted, rest + 1, correcting, way in _LEARNING)

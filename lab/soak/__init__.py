@@ -1,6 +1,6 @@
 """The soak: all processes of a service under faults from a seeded schedule, judged by invariants.
 
-`run` runs a plan that `make_plan` draws, in real time or in one process. The names are loaded on first use: the
+`run` runs a plan that `make_plan` draws, in real time. The names are loaded on first use: the
 processes of a soak import this package and must start fast.
 """
 

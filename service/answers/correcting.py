@@ -226,10 +226,10 @@ class _Read(NamedTuple):
 class QueryCorrection:
     """The correction of an axis' answers to queries that name what is under way.
 
-    The readings are those of the samples. One controller is corrected: its queries go on from the answers before, and
-    the samples show the voltages of these. Queries that compare are answered as without, and so is a controller that
-    adds something of its own, as a follower with readings does. Another one begins, at zero, when the stage has passed
-    the last answer. ``note`` : takes the name of an event and its detail.
+    The readings are those of the samples. One controller is corrected: its queries continue the answers before, and the
+    samples show the voltages of these answers. Queries that compare models get no correction, nor does a controller
+    that adds something of its own, as a follower with readings does. Once the stage has passed the last answer, another
+    controller may begin, at zero. ``note`` : takes the name of an event and its detail.
 
     Any thread may call `answer`; `read` and `forget` are for the one that handles samples. Raises FieldError where the
     axis has no displacement range.
