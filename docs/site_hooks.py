@@ -11,6 +11,8 @@ from typing import Any
 
 from mkdocs.structure.files import File
 
+from dehyst.service.server import state_page
+
 ROOT = Path(__file__).resolve().parents[1]
 #: Files outside this folder -> the page of the site that shows them.
 PAGES = {"README.md": "index.md", "clients/README.md": "clients.md"}
@@ -63,6 +65,7 @@ def on_files(files: Any, config: Any) -> Any:
     clients = re.sub(r"\]\(\.\./docs/", "](", clients)
     files.append(File.generated(config, "clients.md", content=clients))
     files.append(File.generated(config, PROGRAMS, content=programs()))
+    files.append(File.generated(config, "state.md", content=state_page.page()))
     return files
 
 

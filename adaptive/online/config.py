@@ -24,13 +24,12 @@ class LearnerConfig:
     """Frozen configuration of a learner.
 
     window : samples that the LSSVM holds.
-    learn_every, filter_every : samples between two steps of window and filter; the former is rounded down to whole
-    steps of the filter.
+    learn_every, filter_every : samples between two steps of window (whole steps of the filter) and filter.
     eviction : whose slot a new sample takes: its nearest neighbour's, or the oldest's.
     cutoff_hz, lag : of the smoother; without lag, what the cut-off needs.
     serving_age_s : age of the model when its answers take effect; errors are judged at that age.
-    valid_enter, valid_leave : rms prediction error, shares of the voltage span, below which the model is valid again,
-    and above which it no longer is.
+    valid_enter, valid_leave : rms prediction error, shares of the voltage span, at which the model becomes valid again,
+    and invalid.
     fallback_floor : share of the voltage span by which the learner may be worse than the identified model.
     creep_s : time within which what the constant takes up at rest goes over to the frame; 0: it stays.
     before_change : weight of samples of the window from before a detected change of the stage.

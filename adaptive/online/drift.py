@@ -149,10 +149,9 @@ class DriftConfig:
     gain_walk : relative change of the whole linear part, deviation after one second.
     offset_walk, motion_walk, shape_walk : the same, shares of the voltage span: of the constant; of velocity and
     acceleration, at full scale; of all other coefficients.
-    noise : least deviation of one measurement, share of the voltage span; more than the sensor's, since model errors
-    are correlated in time.
-    alike_s : time within which they are alike: the variance of one measurement is the long-term mean square innovation
-    times the measurements within it, so that a stage whose model is far off is learnt more slowly.
+    noise : least deviation of one measurement, share of the voltage span.
+    alike_s : time within which model errors are alike; the variance of one measurement is the long-term mean square
+    innovation times the measurements within it.
     burst_gain, burst_offset, burst_motion : deviations that a sudden change adds.
     burst_ratio : short-term over long-term mean square innovation at which a change is detected.
     burst_floor : an rms innovation below this share of the voltage span is never a change.

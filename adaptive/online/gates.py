@@ -72,8 +72,8 @@ class AdmissionConfig:
     u_min_V, u_max_V : the amplifier's rails (default: the limits of the axis).
     rail_margin_V : a voltage within this of a rail is not learnt.
     y_min_um, y_max_um : range of the sensor.
-    surprise_share, surprise_sigma : a reading this far from its prediction, as a share of the model's range at sample
-    times of up to 1 ms, and this many times the usual error, is held until the next ones explain it.
+    surprise_share, surprise_sigma : a reading this far from its prediction (share of the model's range at up to 1 ms;
+    times the usual error) is held until the next ones explain it.
     glitch_share : a reading this far off is always held.
     jump_share : largest jump, share of the range, believed after glitch_persistence readings.
     glitch_persistence : a jump is believed after more readings at the new level than this.
@@ -269,13 +269,14 @@ def at_rest(
 class EnvelopeConfig:
     """Bounds about the identified model.
 
-    gain : largest factor of change of the stage's or the sensor's gain, up or down. That of a piezo stage changes by a
-    few percent with temperature and age, by 20 to 30 % with amplitude and load.
+    The gain of a piezo stage changes by a few percent with temperature and age, by 20 to 30 % with amplitude and load.
+
+    gain : largest factor of change of the gain of stage or sensor, up or down.
     offset : share of the range by which the zero may move.
     shape : share of the voltage span by which the model may leave the identified linear part, at every point.
-    jump : largest jump, share of the range, accepted from some readings; a larger one needs motion to confirm it.
+    jump : largest jump, share of the range, accepted without motion that confirms it.
     drift_per_s : largest drift of the readings away from the voltage, share of the range a second.
-    follow_s : time of motion for which readings must follow the drive before they are trusted again.
+    follow_s : motion for which readings must follow the drive before they are trusted again.
     """
 
     gain: float = 1.35

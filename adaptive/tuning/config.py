@@ -21,8 +21,7 @@ class RetuneConfig:
     gamma_range, width_range : absolute limits.
     gain : share by which the rms error on fresh samples must fall.
     sigmas : of its own deviations by which the mean difference of the errors' sizes must lie above zero.
-    looks : comparisons, each with twice the samples. Three with 2.29 have the false-positive rate of one with 2
-    (Pocock 1977).
+    looks : comparisons, each with twice the samples; three with 2.29 are as strict as one with 2 (Pocock 1977).
     """
 
     starts: int = 8

@@ -95,7 +95,7 @@ class WindowConfig:
 
 
 #: Relative error of alpha that the inverse form settles at, as a share of cond(R)². Measured from cond 3e3 to 8e7 with
-#: windows of 100 to 500 samples with near-duplicates (docs/solver.md), with some margin.
+#: windows of 100 to 500 samples with near-duplicates (docs/measurements/solver.md), with some margin.
 INVERSE_ERROR_SHARE = 3e-18
 
 #: Arrays whose entry in a state is the array itself.

@@ -19,9 +19,8 @@ class CompetitionConfig:
     horizon_s : time constant of the mean square error, of scored motion.
     margin : factor by which the champion's rms error must exceed a challenger's.
     floor : difference of the two errors beyond that, share of the voltage span.
-    patience_s : scored motion for which both must hold before the challenger replaces the champion. The favourite
-        returns at once, without margin and floor.
-    blend_s : duration of a change of champion in a caller's stream of points.
+    patience_s : scored motion for which both must hold; the favourite returns at once, without margin and floor.
+    blend_s : duration of a change of champion.
 
     Raises InputError on a value out of range.
     """

@@ -410,11 +410,10 @@ generated: `python -m dehyst.service.answers.which_model > docs/which_model.md`.
 
 ## States and transitions
 
-The first row that holds decides. A state is left as soon as its row does not hold. The hysteresis is in what is
-compared: a trouble is over after {recover_s:g} s without a sign of it; a trouble that lasts for `last_good_s`, and
-samples that are so old, take the weight from 1 to 0 within {ramp_s:g} s, and it comes back as fast; a champion and the
-learner's return to the identified model have margins of their own ([the learner](learner.md)). The weight also falls
-with the [distance from what was learnt](protocol.md#limits-stand-in-and-flags), point by point.
+The first row that holds decides. A trouble is over after {recover_s:g} s without a sign of it. A trouble that lasts for
+`last_good_s`, or samples that are so old, take the weight from 1 to 0 within {ramp_s:g} s, and it comes back as fast.
+It also falls with the [distance from what was learnt](protocol.md#limits-stand-in-and-flags), point by point. Champions
+change by [margins](learner.md#competition).
 
 | first of these | `answering` |
 |---|---|

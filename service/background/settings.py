@@ -21,8 +21,8 @@ class WatchConfig:
     collect_s : time of the samples collected after an alarm and then diagnosed.
     gain_alarm : relative change of the gain since the reference that raises an alarm.
     offset_alarm : the same of the offset, share of the voltage span.
-    error_factor, error_floor_pct : an alarm is raised when the learner's recent rms error exceeds this multiple of that
-        in the reference, and this percentage of the voltage span.
+    error_factor, error_floor_pct : recent rms error that raises an alarm: multiple of that in the reference, and
+        percentage of the voltage span.
     hold_s : time for which a condition must last to raise an alarm.
     cooldown_s : least time between two alarms.
     timeout_s : longest time of a diagnosis; then its process is killed.

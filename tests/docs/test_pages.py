@@ -103,3 +103,4 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_outside(tmp_pa
         assert not fetched.search(page.read_text()), f"{page.name} loads something from another host"
     assert "resynchronise" in (tmp_path / "site" / "api.html").read_text()
     assert "corrected_move.py" in (tmp_path / "site" / "programs.html").read_text()
+    assert "learner.filter.covariance" in (tmp_path / "site" / "state.html").read_text()
