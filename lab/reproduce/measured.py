@@ -11,25 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.gates import AdmissionConfig
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.bouc_wen.mechanical import (
-    MechanicalBoucWen,
-    MechanicalReport,
-    PeriodicRecord,
-    identify_mechanical,
-)
 from dehyst.service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
 from dehyst.sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
 from dehyst.sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
 from dehyst.sim.chapter.modelling import ForwardRun, identify_forward
 from dehyst.sim.recordings import ColumnMap, read, repaired
 
-# --- The models on data from others: a measured stack actuator, and the Bouc-Wen benchmark.
+# --- The models on data from others: a measured stack actuator.
 #
 # The folder of data is that of the environment variable ``DEHYST_DATA``, by default ``shared/data`` beside the
 # project.
@@ -39,10 +32,6 @@ Progress = Callable[[str], None]
 #: The two windows of the stack's test recording that its authors report on (first row, row after the last), and what
 #: their result: RMSE between wanted and measured displacement, mean removed, µm.
 WINDOWS = {"linear drive": (5052, 6052, 1.68), "inverse feedforward": (11152, 12152, 0.58)}
-#: Samples of a period of the benchmark's multisines, and their rate, Hz.
-_PERIOD, _RATE_HZ = 8192, 750.0
-#: Best published RMSE on the benchmark's test multisine, m, by method.
-BENCHMARK_PUBLISHED = {"PNLSS": 1.87e-5, "dynoNet": 4.52e-5, "NFIR": 1.63e-4}
 
 
 def data_folder() -> Path:
@@ -153,76 +142,6 @@ def _learning(
     return Identified(names[result.name], online.snapshot(), score, error, time.perf_counter() - start)
 
 
-@dataclass(frozen=True, slots=True)
-class Benchmark:
-    """The Bouc-Wen benchmark: model, its report, and forward prediction of the test multisine, m.
-
-    ``rmse_m``, ``max_m`` : of the prediction with 20 steps a sample; ``rmse_m_40_steps`` : with 40;
-    ``rmse_m_held_input`` : with the force held between samples, not band-limited. ``test_rms_m`` : of the test
-    itself. ``residual_spectrum`` : frequency Hz and amplitude m of what is left.
-    """
-
-    model: MechanicalBoucWen
-    report: MechanicalReport
-    seconds: float
-    rmse_m: float
-    max_m: float
-    test_rms_m: float
-    rmse_m_40_steps: float
-    rmse_m_held_input: float
-    test_y_m: FloatArray
-    test_model_m: FloatArray
-    residual_spectrum: tuple[FloatArray, FloatArray]
-
-
-def _npz(path: Path) -> tuple[FloatArray, FloatArray]:
-    with np.load(path) as content:
-        missing = {"u_N", "y_m"} - set(content.files)
-        if missing:
-            raise InputError(f"{path.name}: no {', '.join(sorted(missing))}, expected the benchmark's arrays")
-        u, y = (np.asarray(content[name], dtype=np.float64).ravel() for name in ("u_N", "y_m"))
-    return u, y
-
-
-def run_benchmark(folder: Path, progress: Progress = lambda _: None) -> Benchmark | None:
-    """Identify on the noisy training periods, predict the noise-free test; None if the files are missing."""
-    files = [folder / f"{name}.npz" for name in ("train_multisine_5periods_noisy", "est_multisine_4periods_noisy")]
-    test_file = folder / "test_multisine.npz"
-    if not all(file.is_file() for file in (*files, test_file)):
-        return None
-    dt_s = 1.0 / _RATE_HZ
-    records = [PeriodicRecord.of(*_npz(file), dt_s, _PERIOD) for file in files]
-    start = time.perf_counter()
-    model, report = identify_mechanical(records, progress=lambda text: progress(f"benchmark: {text}"))
-    seconds = time.perf_counter() - start
-    u, y = _npz(test_file)
-    out = model.steady_state(u, dt_s)
-    error = out - y
-    finer = model.steady_state(u, dt_s, 40)
-    frequency = np.asarray(np.fft.rfftfreq(error.size, dt_s), dtype=np.float64)
-    amplitude = np.asarray(np.abs(np.fft.rfft(error)) * 2.0 / error.size, dtype=np.float64)
-    return Benchmark(
-        model,
-        report,
-        seconds,
-        float(np.sqrt(np.mean(error**2))),
-        float(np.max(np.abs(error))),
-        float(np.sqrt(np.mean(y**2))),
-        float(np.sqrt(np.mean((finer - y) ** 2))),
-        float(np.sqrt(np.mean((_held(model, u, dt_s) - y) ** 2))),
-        y,
-        out,
-        (frequency, amplitude),
-    )
-
-
-def _held(model: MechanicalBoucWen, u_N: FloatArray, dt_s: float) -> FloatArray:
-    """(n,) displacement, m, of the model for a force that is held between samples instead of band-limited."""
-    oversample = 20
-    held = np.repeat(u_N, oversample)
-    return model.steady_state(held, dt_s / oversample, 1)[::oversample]
-
-
 # --- Compute everything that the report needs, with progress messages. No picture is drawn and no file written.
 
 #: Identifications run on one core; CPU time does not depend on the load of the machine.
@@ -267,12 +186,11 @@ class PresetStudy:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """The whole study. ``stack`` and ``benchmark`` are None without their data; ``machine`` is text for the report."""
+    """The whole study. ``stack`` is None without its data; ``machine`` is text for the report."""
 
     config: StudyConfig
     presets: tuple[PresetStudy, ...]
     stack: Stack | None
-    benchmark: Benchmark | None
     seconds: float
     machine: str
 
@@ -297,9 +215,7 @@ def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study
         studies.append(PresetStudy(name, data, character, tuple(forward), control, replayed, taken))
     folder = config.data or data_folder()
     stack = run_stack(folder / "picma_stack", progress) if config.measured else None
-    benchmark = run_benchmark(folder / "boucwen_benchmark", progress) if config.measured else None
-    for found, title in ((stack, "picma_stack"), (benchmark, "boucwen_benchmark")):
-        if found is None and config.measured:
-            progress(f"no measured data {title!r}: set DEHYST_DATA to the folder that holds it; left out")
+    if stack is None and config.measured:
+        progress("no measured data 'picma_stack': set DEHYST_DATA to the folder that holds it; left out")
     machine = f"{platform.machine()}, Python {platform.python_version()}, one BLAS thread"
-    return Study(config, tuple(studies), stack, benchmark, time.perf_counter() - begin, machine)
+    return Study(config, tuple(studies), stack, time.perf_counter() - begin, machine)

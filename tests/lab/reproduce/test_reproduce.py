@@ -53,7 +53,7 @@ def test_every_table_has_the_chapters_numbers_beside_ours(out: Path, numbers: di
     loops = found["table_2_5"]["answer to (2.45)"]
     assert set(loops["lssvm_memory"]) >= {"FF", "FF+FB"}
     assert loops["none"]["FB"]["mae_pct"] > 0.0
-    assert numbers["boucwen_benchmark"] is None
+    assert numbers["picma_stack"] is None
     assert "DEHYST_DATA" in report
 
 
