@@ -285,14 +285,16 @@ def stack_figure(path: Path, found: Stack) -> Path:
     axes[1, 0].set_ylim(-4.0, 4.0)
     legend(axes[1, 0], ncols=2)
     label(axes[1, 0], "time / s", "equivalent error / µm", "b  errors of the inverse models (dashed: learning)")
-    models = [model for model in found.models if not model.failed]
-    at = np.arange(len(models))
+    windows = {r.name: found.windows_rmse_um(r) for r in found.results if r.score is not None}
+    at = np.arange(len(windows))
     for i, name in enumerate(WINDOWS):
-        axes[2, 0].bar(at + 0.4 * (i - 0.5), [m.windows_rmse_um[name] for m in models], 0.38, label=f"window: {name}")
+        axes[2, 0].bar(
+            at + 0.4 * (i - 0.5), [errors[name] for errors in windows.values()], 0.38, label=f"window: {name}"
+        )
     for (start, stop, value), dash in zip(WINDOWS.values(), ("--", ":"), strict=True):
         text = f"published, rows {start} to {stop - 1}: {value} µm"
         axes[2, 0].axhline(value, color="black", ls=dash, lw=1.0, label=text)
-    axes[2, 0].set_xticks(at, [m.name for m in models], fontsize=8, rotation=12)
+    axes[2, 0].set_xticks(at, list(windows), fontsize=8, rotation=12)
     legend(axes[2, 0])
     label(axes[2, 0], "", "RMSE / µm", "c  in the published windows, mean removed")
     return save(drawn, path)

@@ -41,21 +41,6 @@ def data_folder() -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class StackModel:
-    """A model's equivalent displacement errors on the stack's test recording, RMSE in µm.
-
-    whole_... : all of it. windows_... : by name, mean removed, as the authors' figures are. failed : why, or None.
-    """
-
-    name: str
-    seconds: float
-    whole_rmse_um: float
-    whole_rmse_pct: float
-    windows_rmse_um: dict[str, float]
-    failed: str | None
-
-
-@dataclass(frozen=True, slots=True)
 class Stack:
     """The measured stack actuator.
 
@@ -64,7 +49,6 @@ class Stack:
     """
 
     reproduced_um: dict[str, float]
-    models: tuple[StackModel, ...]
     results: tuple[Identified, ...]
     gain_um_per_V: float
     range_um: float
@@ -72,6 +56,12 @@ class Stack:
     u_V: FloatArray
     y_um: FloatArray
     wanted_um: FloatArray
+
+    def windows_rmse_um(self, result: Identified) -> dict[str, float]:
+        """A model's equivalent displacement error in both windows, RMSE, mean removed, µm; empty where it failed."""
+        error = result.error_V * self.gain_um_per_V
+        windows = {} if result.score is None else WINDOWS
+        return {name: _centred_rmse(error[start:stop]) for name, (start, stop, _) in windows.items()}
 
 
 def _centred_rmse(error: FloatArray) -> float:
@@ -101,20 +91,9 @@ def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None
         learning = _learning(result, test, dt_s, gain, range_um, progress)
         if learning is not None:
             results.append(learning)
-    models = []
-    for result in results:
-        error = result.error_V * gain
-        if result.failed or result.score is None:
-            models.append(StackModel(result.name, result.seconds, np.nan, np.nan, {}, result.failed))
-            continue
-        windows = {name: _centred_rmse(error[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
-        whole = result.score.rmse_um
-        models.append(StackModel(result.name, result.seconds, whole, 100.0 * whole / range_um, windows, None))
     y = recording.y_um
     reproduced = {name: _centred_rmse(y[start:stop] - wanted[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
-    return Stack(
-        reproduced, tuple(models), tuple(results), gain, range_um, recording.t_s, recording.u_V, y, np.asarray(wanted)
-    )
+    return Stack(reproduced, tuple(results), gain, range_um, recording.t_s, recording.u_V, y, np.asarray(wanted))
 
 
 #: The gate's default belongs to 1 ms; at 5 ms the prediction error of the smoother is larger. Window and filter learn

@@ -106,7 +106,17 @@ def stack_tables(stack: Stack) -> Numbers:
         "published_rmse_um": {name: entry[2] for name, entry in WINDOWS.items()},
         "reproduced_rmse_um": stack.reproduced_um,
         "range_um": stack.range_um,
-        "models": {model.name: asdict(model) for model in stack.models},
+        "models": {
+            result.name: {
+                "name": result.name,
+                "seconds": result.seconds,
+                "whole_rmse_um": None if result.score is None else result.score.rmse_um,
+                "whole_rmse_pct": None if result.score is None else 100.0 * result.score.rmse_um / stack.range_um,
+                "windows_rmse_um": stack.windows_rmse_um(result),
+                "failed": result.failed or None,
+            }
+            for result in stack.results
+        },
     }
 
 
