@@ -56,7 +56,7 @@ import numpy as np
 import dehyst.adaptive.online
 from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
-from benchmarks.measured import RECORDS, Cut, data_folder, replayed
+from benchmarks.measured import RECORDS, Cut, data_folder, learnt
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
@@ -64,9 +64,8 @@ from dehyst.adaptive.online.drift import DriftConfig, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow
-from dehyst.adaptive.online.learner import Judgement, Learner, Parts
-from dehyst.adaptive.smoothing import smooth_recording
-from dehyst.adaptive.types import FloatArray, InverseModel, Sample
+from dehyst.adaptive.online.learner import Judgement, Parts
+from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.lab.rehearsal import (
     SENSOR,
     Event,
@@ -79,7 +78,6 @@ from dehyst.lab.rehearsal import (
 )
 from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.answers.guard import Limits
-from dehyst.service.config.learner import learner_config
 from dehyst.service.config.settings import LEARN
 from dehyst.service.identification.identifying import Stretch, identify_one
 from dehyst.service.reports.tables import markdown
@@ -189,35 +187,17 @@ class RecordCase:
     @classmethod
     def of(cls, cut: Cut, name: str) -> RecordCase:
         """Raises what an identification raises."""
-        smoother, n = LearnerConfig().smoother(cut.dt_s), cut.split
+        n = cut.split
         last = min(cut.u_V.size, n + SAMPLES + 2 * LATER)
-        pieces = [slice(0, n), slice(n, last)] if cut.jump else [slice(0, last)]
-        moved = np.concatenate([smooth_recording(cut.y_um[piece], smoother) for piece in pieces])
-        u_V, y_um = cut.u_V[:last], cut.y_um[:last]
-        whole = Stretch(u_V, y_um, moved, np.ones(u_V.size, dtype=np.bool_))
-        model = identify_one(LEARN, u_V[:n], y_um[:n], cut.dt_s, 500)
+        cut = replace(cut, u_V=cut.u_V[:last], y_um=cut.y_um[:last])
+        model = identify_one(LEARN, cut.u_V[:n], cut.y_um[:n], cut.dt_s, 500)
         assert isinstance(model, LssvmInverse)
-        (u_low, u_high), (y_low, y_high) = (
-            (float(x.min() - 0.25 * np.ptp(x)), float(x.max() + 0.25 * np.ptp(x))) for x in (u_V, y_um)
-        )
-        limits = Limits(u_low, u_high, math.inf, y_low, y_high)
-        return cls(name, "record", model, whole.part(n, last), cut.dt_s, limits, float(np.ptp(u_V[:n])))
+        span_V = float(np.ptp(cut.u_V[:n]))
+        return cls(name, "record", model, cut.whole.part(n, last), cut.dt_s, cut.limits, span_V)
 
     def run(self, noise: int, settings: Settings) -> Numbers:
         test, dt_s = self.test.part(noise * LATER, len(self.test)), self.dt_s
-        made = Learner.from_model(self.model, learner_config(settings, self.limits, "learner"))
-        said: list[str] = []
-
-        def teach(part: slice) -> None:
-            for k in range(part.start, part.stop):
-                said.append(made.handle(Sample(k, k * dt_s, float(test.u_V[k]), float(test.y_um[k]))))
-
-        def newest() -> tuple[int, InverseModel, FloatArray] | None:
-            snapshot = made.snapshot()
-            memory = made.memory_for(snapshot)
-            return None if memory is None else (made.seq, snapshot, memory)
-
-        got = replayed(test, dt_s, teach, newest, lambda _seq, at, memory, to: at.feedforward(*to, memory).u_V)
+        got, said = learnt(self.model, test, dt_s, self.limits, settings)
         first = round(SKIPPED * len(test))
         error_pct = np.nan_to_num(100.0 / self.span_V * np.abs(got - test.u_V)[first:])
         refused = float(np.mean([name not in TAKEN for name in said[first:]]))
