@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dehyst.adaptive.compiled import compiled
-from dehyst.adaptive.errors import DehystError, InputError
+from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.baselines.bouc_wen.model import BoucWenParameters
 from dehyst.baselines.bouc_wen.step import hysteresis_step, poles, run_stage
@@ -22,21 +22,6 @@ from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters, from_invers
 from dehyst.baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
 
 # --- Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts.
-
-
-class MissingTorchError(DehystError, ImportError):
-    """torch is not installed; the message says how to install it."""
-
-
-def torch_module() -> Any:
-    """The torch module. Raises MissingTorchError where it cannot be imported."""
-    try:
-        return importlib.import_module("torch")
-    except ImportError as error:
-        raise MissingTorchError(
-            f"torch: {error}; identification by swarm needs it: pip install 'dehyst[torch]', or use the least-squares "
-            "identification, which does not need it"
-        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +71,10 @@ def minimise(
     """Minimise ``cost`` over the box from ``lower`` to ``upper`` (dimensions,).
 
     ``cost`` maps a (particles, dimensions) float64 tensor to a (particles,) tensor; a value that is not finite counts
-    as infinite. The result is deterministic for a seed. Raises MissingTorchError, and InputError where no particle ever
-    has a finite cost.
+    as infinite. The result is deterministic for a seed. Raises ModuleNotFoundError without torch, InputError where no
+    particle ever has a finite cost.
     """
-    torch = torch_module()
+    torch: Any = importlib.import_module("torch")
     generator = torch.Generator().manual_seed(config.seed)
     low = torch.as_tensor(np.asarray(lower, dtype=np.float64))
     high = torch.as_tensor(np.asarray(upper, dtype=np.float64))
@@ -176,11 +161,11 @@ def swarm_bouc_wen(
 
     Takes and returns what ``identify_bouc_wen`` does. The offset of the displacement, which the chapter's model lacks,
     is solved for within the cost. The swarm is a batch in torch; a compiled loop simulates its stages, because 500
-    dependent samples give a tensor library nothing to do in parallel. Raises InputError, MissingTorchError.
+    dependent samples give a tensor library nothing to do in parallel. Raises as `minimise`.
     """
     u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
     setup = config or SwarmConfig()
-    torch = torch_module()
+    torch: Any = importlib.import_module("torch")
 
     def cost(theta: Any) -> Any:
         return torch.as_tensor(bouc_wen_costs(theta.numpy(), u, y, dt))
@@ -201,12 +186,12 @@ def swarm_mpi(
 
     The residual is measured after all weights are scaled so that the inverse saturation maps the recorded stroke onto
     itself, the scale constraint of ``identify_mpi``; all weights zero then cost infinitely much. The offset of x is
-    solved for within the cost. The whole swarm is evaluated in torch as one batch of quadratic forms. Raises
-    InputError, MissingTorchError.
+    solved for within the cost. The whole swarm is evaluated in torch as one batch of quadratic forms. Raises as
+    `minimise`.
     """
     u, y, dt = checked_recording(u_V, y_um, dt_s, PLAYS + ZONES + 4)
     setup = config or SwarmConfig()
-    torch = torch_module()
+    torch: Any = importlib.import_module("torch")
     grid = MpiGrid.of(u, y)
     plays = play_run(u, grid.r_V, play_start(float(u[0]), grid.r_V))
     columns = np.hstack([plays, -dead_zone(y - grid.y_ref_um, grid.d_star_um)])

@@ -175,7 +175,7 @@ class Study:
 
 
 def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study:
-    """Run the study. Raises InputError for an unknown preset, MissingTorchError for swarms without torch."""
+    """Run the study. Raises InputError for an unknown preset, ModuleNotFoundError for swarms without torch."""
     begin = time.perf_counter()
     studies = []
     for name in config.presets:
