@@ -23,7 +23,7 @@ def warm() -> None:
     mpi = MpiParameters((0.0, 0.5), (8.0, 2.0), (0.0, 5.0), (1.0, -0.1), lag_s=1e-3)
     play_run(u, mpi.r_, mpi.start())
     mpi.simulate(u, 1e-3)
-    bouc_wen_costs(TABLE_2_1_UPPER[None, :] * 0.4, u, u, 1e-3, True)
+    bouc_wen_costs(TABLE_2_1_UPPER[None, :] * 0.4, u, u, 1e-3)
     bouc_wen, inverse = BoucWenInverse(TABLE_2_1, 1e-3, domain, 0.01), MpiInverse(mpi, 1e-3, domain, 0.01)
     for model in (bouc_wen, inverse):
         memory = model.rest_memory(1.0)

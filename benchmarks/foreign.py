@@ -6,9 +6,8 @@ tables: the goals with the results, and one row for each class of events. ``--ta
 finished runs. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute errors in percent of
 the commanded range.
 
-``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, with the learning loop alone, until
-the file holds that many hours of simulated time, and prints each trouble that was reported. Further calls go on where
-the file ends.
+``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, until the file holds that
+many hours of simulated time, and prints each trouble that was reported. Further calls go on where the file ends.
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
 on stages on which nothing happens, and adds to the file.
@@ -63,6 +62,8 @@ LINE = (
 
 #: Class of healthy runs in the files. Length of such a run: as many samples as this, within these limits, s.
 HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
+#: From here on the errors of a healthy run count, s: what comes before is the start.
+HEALTHY_AT_S = 4.0
 #: Healthy runs end when so many have failed.
 MOST_FAILED = 10
 
@@ -96,9 +97,8 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
 
 
 def run_healthy_stage(seed: int, block: int) -> Record:
-    """A run of the learning loop alone, in which nothing happens, as JSON values. If it raises, the record holds the
-    traceback."""
-    from dehyst.lab.rehearsal import RehearsalConfig, identify, run_healthy
+    """A run in which nothing happens, as JSON values. If it raises, the record holds the traceback."""
+    from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
     from tests.foreign.plants import random_plant
 
     record: Record = {"seed": seed, "class": HEALTHY, "block": block}
@@ -106,9 +106,20 @@ def run_healthy_stage(seed: int, block: int) -> Record:
         factory = random_plant(seed)
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
-        config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block)
-        duration_s = float(np.clip(HEALTHY_SAMPLES * factory.traits.dt_s, *HEALTHY_S))
-        record |= run_healthy(factory, identify(factory, config), config, duration_s, seed).as_dict()
+        after_s = float(np.clip(HEALTHY_SAMPLES * factory.traits.dt_s, *HEALTHY_S)) - HEALTHY_AT_S
+        config = RehearsalConfig(
+            excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block, after_s=after_s
+        )
+        run = run_event(factory, identify(factory, config), config, Event("none", "none", HEALTHY_AT_S), seed)
+        course, out = run.adaptive, run.outcome.as_dict()
+        start, course_um = round(HEALTHY_AT_S / factory.traits.dt_s), np.abs(course.wanted_um - course.true_um)
+        record |= {
+            "simulated_s": out["simulated_s"],
+            "range_um": run.range_um,
+            "figures": out["adaptive"],
+            "mean_pct": 100.0 / run.range_um * float(course_um[start:].mean()),
+            "troubles": [one | {"named_s": one["named_s"] + HEALTHY_AT_S} for one in out["troubles"]],
+        }
     return record
 
 
@@ -551,9 +562,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument("--poor", action="store_true", help="--motions: identify from 2 s of half the stroke")
     parser.add_argument(
-        "--true-length", action="store_true", help="--motions: hold for an hour, stand for a night; takes hours"
-    )
-    parser.add_argument(
         "--block", type=int, default=5, metavar="N",
         help="samples per query and snapshot of --healthy (5): fewer queries cost less, and answers are older",
     )  # fmt: skip
@@ -647,7 +655,7 @@ def _run_motions(given: argparse.Namespace, names: Sequence[str], jobs: int) -> 
     recording = foreign_motions.RECORDINGS[given.poor]
     plan = [
         (
-            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after, given.true_length),
+            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after),
             {"seed": seed, "recording": recording, "motion": name},
         )
         for name, seed in foreign_motions.planned(names, given.first_seed, given.runs)

@@ -1,8 +1,7 @@
 """The Bouc-Wen stage, equations (2.1)-(2.3).
 
 `BoucWenParameters` is the model, `step.hysteresis_step` its exact step, `identify_bouc_wen` identifies it,
-`BoucWenInverse` inverts it and `BoucWenOnline` adapts it. ``mechanical`` is the related oscillator whose hysteresis
-acts in the restoring force. The names are loaded on first use.
+`BoucWenInverse` inverts it and `BoucWenOnline` adapts it. The names are loaded on first use.
 """
 
 from __future__ import annotations

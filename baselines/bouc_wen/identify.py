@@ -54,8 +54,8 @@ def _unpack(theta: FloatArray) -> tuple[FloatArray, float, float]:
 class _Fit:
     """The residual of a recording as a function of the unknowns."""
 
-    def __init__(self, u_V: FloatArray, y_um: FloatArray, dt_s: float, hold: str, free_start: bool) -> None:
-        self.u, self.y, self.dt, self.linear, self.free_start = u_V, y_um, dt_s, hold == "linear", free_start
+    def __init__(self, u_V: FloatArray, y_um: FloatArray, dt_s: float, free_start: bool) -> None:
+        self.u, self.y, self.dt, self.free_start = u_V, y_um, dt_s, free_start
         self.evaluations = 0
         self._out = np.empty((u_V.size, 3))
         self._t = np.arange(u_V.size) * dt_s
@@ -70,7 +70,7 @@ class _Fit:
         else:
             g = hysteresis_step(0.0, u0, shape[0], shape[1], shape[2])
         p1, p2 = poles(lag, inertia)
-        run_stage(self.u, self.dt, p1, p2, shape, self.linear, settled(u0, g), self._out)
+        run_stage(self.u, self.dt, p1, p2, shape, True, settled(u0, g), self._out)
         decay = np.exp(np.maximum(p1.real * self._t, -700.0))
         return np.column_stack([self._out[:, 0], np.ones(self.u.size), decay])
 
@@ -120,19 +120,12 @@ def independent_samples(residual: FloatArray) -> float:
     return residual.size * (1.0 - correlation) / (1.0 + max(correlation, -0.9))
 
 
-def identify_bouc_wen(
-    u_V: ArrayLike,
-    y_um: ArrayLike,
-    dt_s: float,
-    *,
-    hold: str = "linear",
-) -> tuple[BoucWenParameters, FitReport]:
-    """Bouc-Wen stage of a recording, by least squares.
+def identify_bouc_wen(u_V: ArrayLike, y_um: ArrayLike, dt_s: float) -> tuple[BoucWenParameters, FitReport]:
+    """Bouc-Wen stage of a recording with the linear hold, by least squares.
 
     Parameters
     ----------
     u_V, y_um : (n,) voltage V and displacement µm, ``dt_s`` s apart, n >= 20.
-    hold : how the voltage runs within a step, see :mod:`baselines.bouc_wen.model`.
 
     The initial hysteresis is an unknown where the first voltage is above 5 % of the largest; else the stage came
     monotonically from 0 V. m and b are expressed with the stiffness of Table 2.1: a recording does not show it.
@@ -142,13 +135,13 @@ def identify_bouc_wen(
     u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
     free = abs(u[0]) > 0.05 * float(np.max(np.abs(u)))
     stride = max(1, min(u.size // _SEARCH_SAMPLES, int(_SEARCH_DT_S / dt)))
-    thin = _Fit(u[::stride], y[::stride], dt * stride, "linear" if stride > 1 else hold, free)
+    thin = _Fit(u[::stride], y[::stride], dt * stride, free)
     extra = ((0.5 * math.copysign(1.0, u[0]),),) if free else ((),)
     found = [thin.solve(np.array([*start, *more]), 60) for start in _STARTS for more in extra]
     best = min(found, key=lambda result: float(result.cost))
     full = thin
     if stride > 1:
-        full = _Fit(u, y, dt, hold, free)
+        full = _Fit(u, y, dt, free)
         best = full.solve(best.x, 25)
     without = full.solve(best.x, 25, inertia=False)
     if (without.cost - best.cost) * independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
@@ -169,7 +162,6 @@ def identify_bouc_wen(
         beta_per_V=float(shape[1]),
         gamma_per_V=float(shape[2]),
         offset_um=float(offset),
-        hold=hold,
     )
     starts = sorted(float(math.sqrt(2.0 * result.cost / thin.u.size)) for result in found)
     notes = (
@@ -181,14 +173,14 @@ def identify_bouc_wen(
         f"k_N_per_m is given, not identified: {k_N_per_m:.6g}",
     )
     evaluations = thin.evaluations + (full.evaluations if full is not thin else 0)
-    method = f"least squares from {len(found)} starts, {hold} hold, initial hysteresis {'free' if free else 'rest'}"
+    method = f"least squares from {len(found)} starts, linear hold, initial hysteresis {'free' if free else 'rest'}"
     report = FitReport.of("bouc_wen", method, y, y + residual, dt, evaluations, bool(best.status > 0), notes)
     return parameters, report
 
 
 def fit_bouc_wen(
-    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, hold: str = "linear", serve_dt_s: float | None = None
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, serve_dt_s: float | None = None
 ) -> tuple[BoucWenInverse, FitReport]:
     """Identify a Bouc-Wen stage with ``identify_bouc_wen`` and invert it; other arguments as in ``fit_linear``."""
-    parameters, report = identify_bouc_wen(u_V, y_um, dt_s, hold=hold)
+    parameters, report = identify_bouc_wen(u_V, y_um, dt_s)
     return BoucWenInverse.of(parameters, report, u_V, serve_dt_s)

@@ -17,13 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
 from dehyst.baselines.common import FitReport, checked_recording
 from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, from_inverse_saturation
 from dehyst.baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
 
+#: Plays and dead zones besides the zero ones, as in the chapter.
+PLAYS, ZONES = 12, 6
+#: Rounds that turn the error of (2.40) into one of displacement.
+_ROUNDS = 2
 #: Weight of the scale constraint relative to the mean row; rescaling makes the constraint exact afterwards.
 _SCALE_WEIGHT = 1e3
 #: Samples whose residual exceeds this multiple of the RMS are left out of a second fit.
@@ -43,13 +46,11 @@ class MpiGrid:
     stroke_um: float
 
     @staticmethod
-    def of(u_V: FloatArray, y_um: FloatArray, n: int, m: int) -> MpiGrid:
-        """n plays and m dead zones besides the zero ones, at equal intervals over the largest |u| and the stroke."""
-        if n < 1 or m < 0:
-            raise InputError(f"n, m: got {n}, {m}, expected n >= 1 plays and m >= 0 dead zones; the chapter: 12, 6")
+    def of(u_V: FloatArray, y_um: FloatArray) -> MpiGrid:
+        """Plays and dead zones at equal intervals over the largest |u| and the stroke."""
         y_ref, stroke = float(y_um.min()), float(np.ptp(y_um))
-        r = np.arange(n + 1) / (n + 1) * float(np.max(np.abs(u_V)))
-        return MpiGrid(r, np.arange(m + 1) / (m + 1) * stroke, y_ref, stroke)
+        r = np.arange(PLAYS + 1) / (PLAYS + 1) * float(np.max(np.abs(u_V)))
+        return MpiGrid(r, np.arange(ZONES + 1) / (ZONES + 1) * stroke, y_ref, stroke)
 
     @property
     def size(self) -> int:
@@ -120,14 +121,7 @@ def _best_lag(
 
 
 def identify_mpi(
-    u_V: ArrayLike,
-    y_um: ArrayLike,
-    dt_s: float,
-    *,
-    n: int = 12,
-    m: int = 6,
-    fit_lag: bool = False,
-    rounds: int = 2,
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, fit_lag: bool = False
 ) -> tuple[MpiParameters, FitReport]:
     """MPI model of a recording by non-negative least squares on (2.40).
 
@@ -135,23 +129,21 @@ def identify_mpi(
     ----------
     u_V, y_um : (samples,) voltage V and displacement µm, ``dt_s`` s apart, in the order of the recording. The stage
         was at rest before; the initial states are those of (2.5) with y0 = 0.
-    n, m : plays and dead zones besides the zero ones, at (2.38), (2.39).
     fit_lag : also find the first-order lag, s, with the smallest residual; the chapter's model has none.
-    rounds : reweighting rounds that turn the error of (2.40) into one of displacement.
 
     Samples with a residual above eight times the RMS, such as an initial transient, are left out of a second fit. A
     rate-independent model cannot hold them. The report counts them and includes them in its errors.
 
     Returns the parameters and a report. Raises InputError on an unusable recording.
     """
-    u, y, dt = checked_recording(u_V, y_um, dt_s, n + m + 4)
+    u, y, dt = checked_recording(u_V, y_um, dt_s, PLAYS + ZONES + 4)
     lower_span = float(np.ptp(u))
     velocity = np.gradient(y, dt)
     keep = np.ones(u.size, dtype=np.bool_)
     evaluations, left_out = 0, 0
     parameters = MpiParameters((0.0,), (1.0,))
     for _ in range(2):
-        grid = MpiGrid.of(u, y[keep], n, m)
+        grid = MpiGrid.of(u, y[keep])
         plays = play_run(u, grid.r_V, play_start(float(u[0]), grid.r_V))
         lower = grid.lower_bounds(lower_span)
         lag = 0.0
@@ -159,8 +151,8 @@ def identify_mpi(
             lag, tried = _best_lag(plays[keep], y[keep], velocity[keep], dt, grid, lower)
             evaluations += tried
         lead_um = (y + lag * velocity)[keep] - grid.y_ref_um
-        unknowns, rms = _solve(plays[keep], lead_um, grid, lower, rounds)
-        evaluations += 1 + rounds
+        unknowns, rms = _solve(plays[keep], lead_um, grid, lower, _ROUNDS)
+        evaluations += 1 + _ROUNDS
         parameters = grid.model(unknowns, lag)
         beyond = np.abs(parameters.simulate(u, dt) - y) > _OUTLIER_RMS * rms
         if not beyond.any() or beyond.sum() > 0.02 * u.size:
@@ -170,7 +162,7 @@ def identify_mpi(
         "scale: the inverse saturation maps the recorded stroke onto itself",
         f"{left_out} samples beyond {_OUTLIER_RMS:g} times the RMS left out of the fit",
     )
-    method = f"non-negative least squares on (2.40), n={n}, m={m}"
+    method = f"non-negative least squares on (2.40), n={PLAYS}, m={ZONES}"
     report = FitReport.of("mpi", method, y, parameters.simulate(u, dt), dt, evaluations, True, notes)
     return parameters, report
 

@@ -36,11 +36,8 @@ from dehyst.service.client.client import Client
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.settings import read_config
 from dehyst.service.identification.identifying import NAMES, Stretch, identify_all
-from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import ServiceError
-from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.model import encode_model
-from dehyst.service.runtime.session import SURELY, open_client, wait_followed
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.server.deltas import DeltaStreams
@@ -57,52 +54,6 @@ from dehyst.sim.stage.stage import Stage
 
 #: A process may end so much later than planned, s.
 _OVERTIME_S: Final = 30.0
-#: Longest time for which samples of a stage that has ended are on their way to this process, on a busy machine, s.
-_ON_THE_WAY_S: Final = 5.0
-
-
-def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: Callable[[int], None]) -> None:
-    """Drive a stage process with the chapter's training signal (2.37) and record the samples that it publishes.
-
-    Raises ServiceError if samples are missing.
-    """
-    u_V = plan.identification_voltage()
-    keys = Keys(STAGE, AXIS)
-    received = 0
-
-    def take(sample: zenoh.Sample) -> None:
-        nonlocal received
-        batch = wire.decode_samples(sample.payload.to_bytes())
-        recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, "identification")
-        received += len(batch)
-
-    with Rig(logs) as rig:
-        options = ["--listen", rig.endpoint, *_stage_options(plan, len(u_V), changing=False)]
-        stage = rig.start_stage(STAGE, AXIS, *options, name="stage-identification")
-        with open_client(rig.endpoint, READY_S) as session:
-            subscriber = session.declare_subscriber(keys.sample, take)
-            commands = session.declare_publisher(keys.command, congestion_control=SURELY)
-            # The subscription must have reached the stage before its clock starts.
-            time.sleep(0.3)
-            if not wait_followed(commands, READY_S):
-                raise ServiceError(
-                    f"identification: no stage takes commands within {READY_S:g} s: {stage.output_tail()}"
-                )
-            for first in range(0, len(u_V), 1000):
-                commands.put(wire.encode_command(first, u_V[first : first + 1000]))
-            until = time.monotonic() + plan.identify_s + _OVERTIME_S
-            running = True
-            while received < len(u_V) and time.monotonic() < until:
-                if running and not stage.running:
-                    running, until = False, min(until, time.monotonic() + _ON_THE_WAY_S)
-                progress(received)
-                time.sleep(0.2)
-            if stage.wait(_OVERTIME_S) != 0 or received < len(u_V):
-                raise ServiceError(
-                    f"identification: got {received} of {len(u_V)} samples; stage: {stage.output_tail()}"
-                )
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
-            commands.undeclare()  # type: ignore[no-untyped-call]
 
 
 def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], progress: Progress) -> DemoRun:
@@ -118,7 +69,7 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         shown = [f"--twin={unit}={name}" for name, unit in twins.items()]
         viewer = rig.start_viewer(rrd, STAGE, AXIS, plan.range_um, *view, *shown)
         where = ["--endpoint", rig.endpoint, "--twins", ",".join(twins.values())]
-        stage = rig.start_stage(STAGE, AXIS, *where, *_stage_options(plan, plan.ticks, changing=True))
+        stage = rig.start_stage(STAGE, AXIS, *where, *_stage_options(plan))
         loop = rig.start_paced_loop(plan.dt_s, plan.ticks, wait=False)
         program = ["-m", "dehyst.lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
         controller = rig.start("controller", program, wait=False)
@@ -132,12 +83,12 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         return _collect(result, server, stage, loop)
 
 
-def _stage_options(plan: Plan, ticks: int, *, changing: bool) -> list[str]:
-    options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(ticks * plan.dt_s)]
+def _stage_options(plan: Plan) -> list[str]:
+    options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(plan.ticks * plan.dt_s)]
     options += ["--file", plan.stage_file] if plan.stage_file else []
     options += ["--batch", str(plan.block)]
     options += [] if plan.strict else ["--lock-step", repr(LOCK_STEP_S)]
-    for t_s, values in plan.stage(changing=changing).changes:
+    for t_s, values in plan.stage(changing=True).changes:
         options += ["--change", f"{t_s!r}:" + ",".join(f"{name}={value!r}" for name, value in values.items())]
     return options
 
@@ -331,7 +282,7 @@ def run(
     how = (duration_s, seed, strict)
     plan = make_plan(*how) if own is None else plan_for(own, logs, *how)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
-    _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))
+    _record(plan, out / "identification")
     say("[2/4] identifying five inverse models from 10 s at 1 kHz")
     model = out / "model.npz"
     _identify(plan, out / "identification", model, say)
@@ -341,11 +292,16 @@ def run(
     say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
     rig = Rig(logs)
     config = _configure(plan, out, logs / "serve.toml", rig.endpoint)
-    show = _Bar(plan.run_s, say)
+    next_s = 5.0
 
     def progress(ticks: int, error_um: dict[str, float]) -> None:
-        parts = ", ".join(f"{name} {100.0 * value / plan.range_um:.3f}" for name, value in error_um.items())
-        show(ticks * plan.dt_s, f"mean |error| of the last second, % of range: {parts}")
+        nonlocal next_s
+        done_s = ticks * plan.dt_s
+        if done_s + 1e-9 >= next_s:
+            next_s = (done_s // 5.0 + 1.0) * 5.0
+            parts = ", ".join(f"{name} {100.0 * value / plan.range_um:.3f}" for name, value in error_um.items())
+            bar = f"[{'#' * round(20.0 * min(1.0, done_s / plan.run_s)):<20}] {done_s:4.0f} of {plan.run_s:g} s"
+            say(f"  {bar}  mean |error| of the last second, % of range: {parts}")
 
     if fast:
         axis = load_axis(STAGE, read_config(config).axes[0])
@@ -365,29 +321,11 @@ def run(
     return Done(plan, done, summary)
 
 
-class _Bar:
-    """Prints a line of progress every five seconds of the run, and at its end."""
-
-    def __init__(self, total_s: float, say: Say) -> None:
-        self._total_s, self._say, self._next_s = total_s, say, 5.0
-
-    def __call__(self, done_s: float, detail: str = "") -> None:
-        if done_s + 1e-9 < self._next_s:
-            return
-        self._next_s = (done_s // 5.0 + 1.0) * 5.0
-        filled = round(20.0 * min(1.0, done_s / self._total_s))
-        self._say(f"  [{'#' * filled:<20}] {done_s:4.0f} of {self._total_s:g} s  {detail}".rstrip())
-
-
-def _record(plan: Plan, folder: Path, logs: Path, fast: bool, bar: _Bar) -> None:
-    u_V = plan.identification_voltage()
+def _record(plan: Plan, folder: Path) -> None:
+    u_V, stage = plan.identification_voltage(), Stage(plan.stage(changing=False))
+    y_um, _ = stage.run(stage.initial_state(), u_V)
+    seq = np.arange(u_V.size)
     with Recorder(RecorderConfig(folder)) as recorder:
-        if not fast:
-            record_identification(plan, recorder, logs, lambda received: bar(received * plan.dt_s))
-            return
-        stage = Stage(plan.stage(changing=False))
-        y_um, _ = stage.run(stage.initial_state(), u_V)
-        seq = np.arange(u_V.size)
         recorder.put(seq, seq * plan.dt_s, u_V, y_um, "identification")
 
 

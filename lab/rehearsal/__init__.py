@@ -12,7 +12,7 @@ from dehyst.lab.rehearsal.config import RehearsalConfig
 from dehyst.lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, SENSOR, STANDARD, Event, draw
 from dehyst.lab.rehearsal.plant import Change, IdentifiedPlant, PlantFactory, factory_of, identify
 from dehyst.lab.rehearsal.reference import Motion, RandomReference
-from dehyst.lab.rehearsal.rehearsal import rehearse, run_event, run_healthy, standard_events
+from dehyst.lab.rehearsal.rehearsal import rehearse, run_event, standard_events
 
 __all__ = [
     "CLASSES",
@@ -31,6 +31,5 @@ __all__ = [
     "identify",
     "rehearse",
     "run_event",
-    "run_healthy",
     "standard_events",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -135,30 +135,6 @@ class Outcome:
         return form
 
 
-@dataclass(frozen=True, slots=True)
-class HealthyOutcome:
-    """A run of the learning loop in which nothing happened.
-
-    Attributes
-    ----------
-    simulated_s : its length, s. range_um : what errors refer to. figures : errors; "before" is the start. mean_pct :
-    mean absolute error after the start, percent of the range. troubles : what the axis reported; times in s from the
-    start of the run. noted : names of the axis' events with their counts.
-    """
-
-    simulated_s: float
-    range_um: float
-    figures: ErrorFigures
-    mean_pct: float
-    troubles: tuple[Trouble, ...]
-    noted: dict[str, int]
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON form: values that are not finite become null, numbers have seven digits."""
-        form: dict[str, Any] = json_form(asdict(self))
-        return form
-
-
 def figures(course: LoopRecord, event: Event, range_um: float, limits: Limits, dt_s: float) -> ErrorFigures:
     """The figures of one run of one model."""
     error_pct = _error_pct(course, range_um)
@@ -222,19 +198,6 @@ def outcome(
         jumps=int(adaptive.jumps[-1] - adaptive.jumps[max(0, round(event.at_s / dt_s) - 1)]),
         noted=_noted(adaptive, event.at_s),
         simulated_s=adaptive.t_s.size * dt_s,
-    )
-
-
-def healthy_outcome(event: Event, course: LoopRecord, range_um: float, limits: Limits, dt_s: float) -> HealthyOutcome:
-    """The outcome of a run of the learning loop; ``event`` says when the start is over."""
-    troubles = _troubles(course, event, range_um, dt_s)
-    return HealthyOutcome(
-        simulated_s=course.t_s.size * dt_s,
-        range_um=range_um,
-        figures=figures(course, event, range_um, limits, dt_s),
-        mean_pct=_mean(_error_pct(course, range_um)[round(event.at_s / dt_s) :]),
-        troubles=tuple(replace(t, named_s=t.named_s + event.at_s, until_s=t.until_s + event.at_s) for t in troubles),
-        noted=_noted(course, 0.0),
     )
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -30,9 +30,7 @@ from dehyst.lab.rehearsal.outcome import (
     LARGE_PCT,
     SENSOR_FACTOR,
     SENSOR_PCT,
-    HealthyOutcome,
     Outcome,
-    healthy_outcome,
     outcome,
 )
 from dehyst.lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
@@ -50,8 +48,6 @@ from dehyst.service.viewer.colours import ADAPTIVE, EVENT, FROZEN, TROUBLE
 
 #: Stage and axis name of the rehearsed axis.
 STAGE, AXIS = "rehearsal", "x"
-#: From here on the errors of a healthy run count, s: what comes before is the start.
-HEALTHY_AT_S: Final = 4.0
 #: Called with the present step and its progress, 0 to 1.
 Progress = Callable[[str, float], None]
 
@@ -157,17 +153,6 @@ def run_event(
     limits, range_um = course.axis.limits, course.range_um
     result = outcome(event, adaptive, frozen, last, range_um, limits, known.dt_s, learning.left_out)
     return EventRun(event, range_um, adaptive, frozen, last, result)
-
-
-def run_healthy(
-    plant_factory: PlantFactory, known: IdentifiedPlant, config: RehearsalConfig, duration_s: float, seed: int
-) -> HealthyOutcome:
-    """The learning loop alone, for ``duration_s`` (at least 5 s), in which nothing happens. Raises as `rehearse`
-    does."""
-    event = Event("none", "none", HEALTHY_AT_S)
-    course = _Course.prepared(plant_factory, known, config, event, duration_s, seed)
-    record, _ = course.run_adaptive(course.new_plant())
-    return healthy_outcome(event, record, course.range_um, course.axis.limits, known.dt_s)
 
 
 @dataclass(frozen=True, slots=True)

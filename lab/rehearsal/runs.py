@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.lab.loop import Asker, turns
-from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
+from dehyst.lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, MessageLine
 from dehyst.lab.rehearsal.reference import Motion
 from dehyst.service.answers.guard import Limits, guard
 from dehyst.service.server.axis import Axis
@@ -58,33 +58,6 @@ class LoopRecord:
     events: tuple[tuple[float, str, str], ...]
 
 
-class _NameCodes:
-    """Small integers for names."""
-
-    def __init__(self, first: str) -> None:
-        self._numbers = {first: 0}
-
-    def __call__(self, name: str) -> int:
-        return self._numbers.setdefault(name, len(self._numbers))
-
-    @property
-    def known(self) -> tuple[str, ...]:
-        return tuple(self._numbers)
-
-
-class _NumberOffset:
-    """Offset of the stage's sample numbers: sample ``tick`` has the number ``tick + offset``.
-
-    It follows the median of a message, so that a single wrong number has no effect.
-    """
-
-    def __init__(self, offset: int) -> None:
-        self.offset = offset
-
-    def follow(self, message: Message) -> None:
-        self.offset = sorted((message.batch.seq - message.tick).tolist())[message.tick.size // 2]
-
-
 def run_adaptive(
     axis: Axis, plant: DisturbedPlant, sensor: DisturbedSensor, line: MessageLine, wanted: Motion, u_before_V: float,
     block: int, first_number: int, progress: LoopProgress = lambda _: None,
@@ -104,9 +77,9 @@ def run_adaptive(
     flags = np.zeros(n, dtype=np.uint8)
     verdict, trouble = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int16)
     jumps = np.zeros(n, dtype=np.int64)
-    verdicts, troubles = _NameCodes(NEVER_CAME), _NameCodes("")
+    verdicts, troubles = {NEVER_CAME: 0}, {"": 0}  # small integers for names
     events: list[tuple[float, str, str]] = []
-    ask, count = Asker(axis, u_before_V=u_before_V), _NumberOffset(first_number)
+    ask, offset = Asker(axis, u_before_V=u_before_V), first_number  # of the stage's numbers from those of the samples
     newest = -1  # the last sample of the rest
     for run, asked in turns(n // block, 1):
         if run is not None:
@@ -116,24 +89,26 @@ def run_adaptive(
             message = line.carry(part.start, u_V[part], read_um[part])
             if message is not None:
                 for tick, said in zip(message.tick.tolist(), axis.handle(message.batch), strict=True):
-                    verdict[tick] = verdicts(said)
+                    verdict[tick] = verdicts.setdefault(said, len(verdicts))
                 newest = part.stop - 1
-                count.follow(message)
+                # The median of a message: a single wrong number has no effect.
+                offset = sorted((message.batch.seq - message.tick).tolist())[message.tick.size // 2]
             # Known from the end of the block on; until then the value before.
             trouble[part] = trouble[part.start - 1] if part.start else 0
-            trouble[part.stop - 1] = troubles(axis.newest.trouble)
+            trouble[part.stop - 1] = troubles.setdefault(axis.newest.trouble, len(troubles))
             jumps[part] = axis.learner.counters().get("jumps", 0) if axis.learner is not None else 0
-            events += [((part.stop - 1) * dt_s, *_name_and_detail(event)) for event in axis.take_events()]
+            said_s = (part.stop - 1) * dt_s
+            events += [(said_s, str(event["event"]), str(event["detail"])) for event in axis.take_events()]
             progress(part.stop)
         if asked is not None:
             part = slice(asked * block, (asked + 1) * block)
             # The block before is pending; the newest sample that can have come is that of the block before it.
             axis.update_age(max(0, part.start - block - 1 - newest) * dt_s)
-            reply = ask(part.start + count.offset, [values[part] for values in wanted])
+            reply = ask(part.start + offset, [values[part] for values in wanted])
             u_V[part], flags[part] = reply.u_V, reply.flags
     return LoopRecord(
-        times(n, dt_s), wanted.y_um, true_um, read_um, u_V, flags, verdict, verdicts.known, trouble,
-        troubles.known, jumps, tuple(events),
+        times(n, dt_s), wanted.y_um, true_um, read_um, u_V, flags, verdict, tuple(verdicts), trouble,
+        tuple(troubles), jumps, tuple(events),
     )  # fmt: skip
 
 
@@ -157,19 +132,9 @@ def run_frozen(
     true_um, read_um = plant.run(0, u_V)
     none = np.zeros(n, dtype=np.int16)
     return LoopRecord(
-        times(n, model.dt_s),
-        wanted.y_um,
-        true_um,
-        read_um,
-        u_V,
-        flags,
-        none,
-        ("not_learning",),
-        none,
-        ("",),
-        np.zeros(n, dtype=np.int64),
-        (),
-    )
+        times(n, model.dt_s), wanted.y_um, true_um, read_um, u_V, flags, none, ("not_learning",), none, ("",),
+        np.zeros(n, dtype=np.int64), (),
+    )  # fmt: skip
 
 
 def times(n: int, dt_s: float) -> FloatArray:
@@ -181,7 +146,3 @@ def times(n: int, dt_s: float) -> FloatArray:
 def idle_samples(dt_s: float, block: int) -> int:
     """Number of samples of the rest before the first block: whole blocks, at least two."""
     return max(2, math.ceil(IDLE_S / dt_s / block)) * block
-
-
-def _name_and_detail(event: dict[str, Any]) -> tuple[str, str]:
-    return str(event["event"]), str(event["detail"])

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.lab.reproduce.measured import WINDOWS, Benchmark, PresetStudy, Stack
+from dehyst.lab.reproduce.measured import WINDOWS, PresetStudy, Stack
 from dehyst.service.reports.plot_style import figure, label, legend, line, save
-from dehyst.service.viewer.colours import BEFORE, REFERENCE, SERIES, model_colour
+from dehyst.service.viewer.colours import REFERENCE, SERIES, model_colour
 from dehyst.sim.chapter.control import FROZEN, GAIN_CHANGE, LEARNING, Control, Loop, moving_mae
 from dehyst.sim.chapter.experiments import Characterisation, Record, Width
 from dehyst.sim.chapter.forward_lssvm import two_inputs
@@ -263,7 +263,7 @@ def draw_control(folder: Path, study: PresetStudy) -> dict[str, Path]:
     }
 
 
-# The measured stack actuator and the Bouc-Wen benchmark.
+# The measured stack actuator.
 
 
 def stack_figure(path: Path, found: Stack) -> Path:
@@ -285,33 +285,16 @@ def stack_figure(path: Path, found: Stack) -> Path:
     axes[1, 0].set_ylim(-4.0, 4.0)
     legend(axes[1, 0], ncols=2)
     label(axes[1, 0], "time / s", "equivalent error / µm", "b  errors of the inverse models (dashed: learning)")
-    models = [model for model in found.models if not model.failed]
-    at = np.arange(len(models))
+    windows = {r.name: found.windows_rmse_um(r) for r in found.results if r.score is not None}
+    at = np.arange(len(windows))
     for i, name in enumerate(WINDOWS):
-        axes[2, 0].bar(at + 0.4 * (i - 0.5), [m.windows_rmse_um[name] for m in models], 0.38, label=f"window: {name}")
+        axes[2, 0].bar(
+            at + 0.4 * (i - 0.5), [errors[name] for errors in windows.values()], 0.38, label=f"window: {name}"
+        )
     for (start, stop, value), dash in zip(WINDOWS.values(), ("--", ":"), strict=True):
         text = f"published, rows {start} to {stop - 1}: {value} µm"
         axes[2, 0].axhline(value, color="black", ls=dash, lw=1.0, label=text)
-    axes[2, 0].set_xticks(at, [m.name for m in models], fontsize=8, rotation=12)
+    axes[2, 0].set_xticks(at, list(windows), fontsize=8, rotation=12)
     legend(axes[2, 0])
     label(axes[2, 0], "", "RMSE / µm", "c  in the published windows, mean removed")
-    return save(drawn, path)
-
-
-def benchmark_figure(path: Path, found: Benchmark, rate_Hz: float = 750.0) -> Path:
-    """Prediction of the test multisine, its error, and the spectrum of the error."""
-    drawn, axes = figure(3, 1, (10, 8), "Bouc-Wen benchmark: forward prediction of the test multisine")
-    n = 750
-    t_s = np.arange(n) / rate_Hz
-    axes[0, 0].plot(t_s, 1e3 * found.test_y_m[:n], color="black", lw=1.0, label="test")
-    axes[0, 0].plot(t_s, 1e3 * found.test_model_m[:n], color=model_colour("bouc_wen"), lw=0.8, ls="--", label="model")
-    legend(axes[0, 0])
-    label(axes[0, 0], "time / s", "displacement / mm", "a  the first second")
-    whole = np.arange(found.test_y_m.size) / rate_Hz
-    axes[1, 0].plot(whole, 1e6 * (found.test_model_m - found.test_y_m), color=BEFORE, lw=0.4)
-    label(axes[1, 0], "time / s", "error / µm", f"b  model less test: RMSE {1e6 * found.rmse_m:.3f} µm")
-    frequency, amplitude = found.residual_spectrum
-    axes[2, 0].semilogy(frequency[1:], np.abs(np.fft.rfft(found.test_y_m))[1:] * 2 / whole.size, color="black", lw=0.5)
-    axes[2, 0].semilogy(frequency[1:], amplitude[1:], color=BEFORE, lw=0.5)
-    label(axes[2, 0], "frequency / Hz", "amplitude / m", "c  spectrum of the test (black) and of the error")
     return save(drawn, path)

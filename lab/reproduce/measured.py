@@ -11,25 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.gates import AdmissionConfig
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.bouc_wen.mechanical import (
-    MechanicalBoucWen,
-    MechanicalReport,
-    PeriodicRecord,
-    identify_mechanical,
-)
 from dehyst.service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
 from dehyst.sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
 from dehyst.sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
 from dehyst.sim.chapter.modelling import ForwardRun, identify_forward
 from dehyst.sim.recordings import ColumnMap, read, repaired
 
-# --- The models on data from others: a measured stack actuator, and the Bouc-Wen benchmark.
+# --- The models on data from others: a measured stack actuator.
 #
 # The folder of data is that of the environment variable ``DEHYST_DATA``, by default ``shared/data`` beside the
 # project.
@@ -39,31 +32,12 @@ Progress = Callable[[str], None]
 #: The two windows of the stack's test recording that its authors report on (first row, row after the last), and what
 #: their result: RMSE between wanted and measured displacement, mean removed, µm.
 WINDOWS = {"linear drive": (5052, 6052, 1.68), "inverse feedforward": (11152, 12152, 0.58)}
-#: Samples of a period of the benchmark's multisines, and their rate, Hz.
-_PERIOD, _RATE_HZ = 8192, 750.0
-#: Best published RMSE on the benchmark's test multisine, m, by method.
-BENCHMARK_PUBLISHED = {"PNLSS": 1.87e-5, "dynoNet": 4.52e-5, "NFIR": 1.63e-4}
 
 
 def data_folder() -> Path:
     """The folder of measured data."""
     here = Path(__file__).resolve().parents[2]
     return Path(os.environ.get("DEHYST_DATA", here.parent / "shared" / "data"))
-
-
-@dataclass(frozen=True, slots=True)
-class StackModel:
-    """A model's equivalent displacement errors on the stack's test recording, RMSE in µm.
-
-    whole_... : all of it. windows_... : by name, mean removed, as the authors' figures are. failed : why, or None.
-    """
-
-    name: str
-    seconds: float
-    whole_rmse_um: float
-    whole_rmse_pct: float
-    windows_rmse_um: dict[str, float]
-    failed: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +49,6 @@ class Stack:
     """
 
     reproduced_um: dict[str, float]
-    models: tuple[StackModel, ...]
     results: tuple[Identified, ...]
     gain_um_per_V: float
     range_um: float
@@ -83,6 +56,12 @@ class Stack:
     u_V: FloatArray
     y_um: FloatArray
     wanted_um: FloatArray
+
+    def windows_rmse_um(self, result: Identified) -> dict[str, float]:
+        """A model's equivalent displacement error in both windows, RMSE, mean removed, µm; empty where it failed."""
+        error = result.error_V * self.gain_um_per_V
+        windows = {} if result.score is None else WINDOWS
+        return {name: _centred_rmse(error[start:stop]) for name, (start, stop, _) in windows.items()}
 
 
 def _centred_rmse(error: FloatArray) -> float:
@@ -112,20 +91,9 @@ def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None
         learning = _learning(result, test, dt_s, gain, range_um, progress)
         if learning is not None:
             results.append(learning)
-    models = []
-    for result in results:
-        error = result.error_V * gain
-        if result.failed or result.score is None:
-            models.append(StackModel(result.name, result.seconds, np.nan, np.nan, {}, result.failed))
-            continue
-        windows = {name: _centred_rmse(error[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
-        whole = result.score.rmse_um
-        models.append(StackModel(result.name, result.seconds, whole, 100.0 * whole / range_um, windows, None))
     y = recording.y_um
     reproduced = {name: _centred_rmse(y[start:stop] - wanted[start:stop]) for name, (start, stop, _) in WINDOWS.items()}
-    return Stack(
-        reproduced, tuple(models), tuple(results), gain, range_um, recording.t_s, recording.u_V, y, np.asarray(wanted)
-    )
+    return Stack(reproduced, tuple(results), gain, range_um, recording.t_s, recording.u_V, y, np.asarray(wanted))
 
 
 #: The gate's default belongs to 1 ms; at 5 ms the prediction error of the smoother is larger. Window and filter learn
@@ -151,76 +119,6 @@ def _learning(
     error[~test.valid] = np.nan
     score = score_of(error, gain, range_um)
     return Identified(names[result.name], online.snapshot(), score, error, time.perf_counter() - start)
-
-
-@dataclass(frozen=True, slots=True)
-class Benchmark:
-    """The Bouc-Wen benchmark: model, its report, and forward prediction of the test multisine, m.
-
-    ``rmse_m``, ``max_m`` : of the prediction with 20 steps a sample; ``rmse_m_40_steps`` : with 40;
-    ``rmse_m_held_input`` : with the force held between samples, not band-limited. ``test_rms_m`` : of the test
-    itself. ``residual_spectrum`` : frequency Hz and amplitude m of what is left.
-    """
-
-    model: MechanicalBoucWen
-    report: MechanicalReport
-    seconds: float
-    rmse_m: float
-    max_m: float
-    test_rms_m: float
-    rmse_m_40_steps: float
-    rmse_m_held_input: float
-    test_y_m: FloatArray
-    test_model_m: FloatArray
-    residual_spectrum: tuple[FloatArray, FloatArray]
-
-
-def _npz(path: Path) -> tuple[FloatArray, FloatArray]:
-    with np.load(path) as content:
-        missing = {"u_N", "y_m"} - set(content.files)
-        if missing:
-            raise InputError(f"{path.name}: no {', '.join(sorted(missing))}, expected the benchmark's arrays")
-        u, y = (np.asarray(content[name], dtype=np.float64).ravel() for name in ("u_N", "y_m"))
-    return u, y
-
-
-def run_benchmark(folder: Path, progress: Progress = lambda _: None) -> Benchmark | None:
-    """Identify on the noisy training periods, predict the noise-free test; None if the files are missing."""
-    files = [folder / f"{name}.npz" for name in ("train_multisine_5periods_noisy", "est_multisine_4periods_noisy")]
-    test_file = folder / "test_multisine.npz"
-    if not all(file.is_file() for file in (*files, test_file)):
-        return None
-    dt_s = 1.0 / _RATE_HZ
-    records = [PeriodicRecord.of(*_npz(file), dt_s, _PERIOD) for file in files]
-    start = time.perf_counter()
-    model, report = identify_mechanical(records, progress=lambda text: progress(f"benchmark: {text}"))
-    seconds = time.perf_counter() - start
-    u, y = _npz(test_file)
-    out = model.steady_state(u, dt_s)
-    error = out - y
-    finer = model.steady_state(u, dt_s, 40)
-    frequency = np.asarray(np.fft.rfftfreq(error.size, dt_s), dtype=np.float64)
-    amplitude = np.asarray(np.abs(np.fft.rfft(error)) * 2.0 / error.size, dtype=np.float64)
-    return Benchmark(
-        model,
-        report,
-        seconds,
-        float(np.sqrt(np.mean(error**2))),
-        float(np.max(np.abs(error))),
-        float(np.sqrt(np.mean(y**2))),
-        float(np.sqrt(np.mean((finer - y) ** 2))),
-        float(np.sqrt(np.mean((_held(model, u, dt_s) - y) ** 2))),
-        y,
-        out,
-        (frequency, amplitude),
-    )
-
-
-def _held(model: MechanicalBoucWen, u_N: FloatArray, dt_s: float) -> FloatArray:
-    """(n,) displacement, m, of the model for a force that is held between samples instead of band-limited."""
-    oversample = 20
-    held = np.repeat(u_N, oversample)
-    return model.steady_state(held, dt_s / oversample, 1)[::oversample]
 
 
 # --- Compute everything that the report needs, with progress messages. No picture is drawn and no file written.
@@ -267,18 +165,17 @@ class PresetStudy:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """The whole study. ``stack`` and ``benchmark`` are None without their data; ``machine`` is text for the report."""
+    """The whole study. ``stack`` is None without its data; ``machine`` is text for the report."""
 
     config: StudyConfig
     presets: tuple[PresetStudy, ...]
     stack: Stack | None
-    benchmark: Benchmark | None
     seconds: float
     machine: str
 
 
 def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study:
-    """Run the study. Raises InputError for an unknown preset, MissingTorchError for swarms without torch."""
+    """Run the study. Raises InputError for an unknown preset, ModuleNotFoundError for swarms without torch."""
     begin = time.perf_counter()
     studies = []
     for name in config.presets:
@@ -297,9 +194,7 @@ def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study
         studies.append(PresetStudy(name, data, character, tuple(forward), control, replayed, taken))
     folder = config.data or data_folder()
     stack = run_stack(folder / "picma_stack", progress) if config.measured else None
-    benchmark = run_benchmark(folder / "boucwen_benchmark", progress) if config.measured else None
-    for found, title in ((stack, "picma_stack"), (benchmark, "boucwen_benchmark")):
-        if found is None and config.measured:
-            progress(f"no measured data {title!r}: set DEHYST_DATA to the folder that holds it; left out")
+    if stack is None and config.measured:
+        progress("no measured data 'picma_stack': set DEHYST_DATA to the folder that holds it; left out")
     machine = f"{platform.machine()}, Python {platform.python_version()}, one BLAS thread"
-    return Study(config, tuple(studies), stack, benchmark, time.perf_counter() - begin, machine)
+    return Study(config, tuple(studies), stack, time.perf_counter() - begin, machine)

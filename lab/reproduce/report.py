@@ -6,19 +6,16 @@ Why ours differ is told once, on the page *The chapter reproduced* of the docume
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.baselines.bouc_wen.model import BoucWenParameters
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters, inverse_thresholds, inverse_weights
-from dehyst.lab.reproduce.figures import LABELS, benchmark_figure, draw_control, draw_models, stack_figure
-from dehyst.lab.reproduce.measured import BENCHMARK_PUBLISHED, WINDOWS, Benchmark, PresetStudy, Stack, Study
+from dehyst.lab.reproduce.figures import LABELS, draw_control, draw_models, stack_figure
+from dehyst.lab.reproduce.measured import WINDOWS, PresetStudy, Stack, Study
 from dehyst.service.reports.tables import json_form, markdown
 from dehyst.sim.chapter import published
 from dehyst.sim.chapter.control import CHANGE_S, FROZEN, GAIN_CHANGE
@@ -109,26 +106,17 @@ def stack_tables(stack: Stack) -> Numbers:
         "published_rmse_um": {name: entry[2] for name, entry in WINDOWS.items()},
         "reproduced_rmse_um": stack.reproduced_um,
         "range_um": stack.range_um,
-        "models": {model.name: asdict(model) for model in stack.models},
-    }
-
-
-def benchmark_tables(found: Benchmark) -> Numbers:
-    """The Bouc-Wen benchmark: parameters, errors, and how the residual spreads over frequency."""
-    frequency, amplitude = found.residual_spectrum
-    bands = {
-        f"{low}-{high} Hz": math.sqrt(0.5 * float(np.sum(amplitude[(frequency >= low) & (frequency < high)] ** 2)))
-        for low, high in ((0, 5), (5, 30), (30, 50), (50, 150), (150, 375))
-    }
-    errors = ("rmse_m", "max_m", "rmse_m_40_steps", "rmse_m_held_input", "test_rms_m", "seconds")
-    return {name: getattr(found, name) for name in errors} | {
-        "published_rmse_m": BENCHMARK_PUBLISHED,
-        "training_rmse_m": found.report.rmse_m,
-        "training_noise_m": found.report.noise_m,
-        "parameters": asdict(found.model),
-        "beta_gamma_beta_delta": found.model.products,
-        "parameter_std": found.report.std,
-        "residual_rms_m": bands,
+        "models": {
+            result.name: {
+                "name": result.name,
+                "seconds": result.seconds,
+                "whole_rmse_um": None if result.score is None else result.score.rmse_um,
+                "whole_rmse_pct": None if result.score is None else 100.0 * result.score.rmse_um / stack.range_um,
+                "windows_rmse_um": stack.windows_rmse_um(result),
+                "failed": result.failed or None,
+            }
+            for result in stack.results
+        },
     }
 
 
@@ -153,8 +141,6 @@ def targets(study: Study) -> list[Numbers]:
             (f"rich: feedforward alone on {first!r}, LSSVM with memory, MAE %", 0.10, forward),
             (f"rich: feedforward and feedback on {first!r}, LSSVM with memory, MAE %", 0.010, hybrid),
         ]
-    if study.benchmark is not None:
-        found.append(("benchmark: test multisine, RMSE m", 2e-6, study.benchmark.rmse_m))
     return [{"what": what, "limit": limit, "found": got, "met": bool(got <= limit)} for what, limit, got in found]
 
 
@@ -178,7 +164,6 @@ def tables(study: Study) -> Numbers:
         },
         "presets": {preset.name: preset_tables(preset) for preset in study.presets},
         "picma_stack": stack_tables(study.stack) if study.stack is not None else None,
-        "boucwen_benchmark": benchmark_tables(study.benchmark) if study.benchmark is not None else None,
         "targets": targets(study),
     }
     done: Numbers = json_form(whole)
@@ -414,48 +399,6 @@ def stack_section(found: Numbers, pictures: dict[str, str]) -> list[str]:
     ]
 
 
-def benchmark_section(found: Numbers, pictures: dict[str, str]) -> list[str]:
-    """The Bouc-Wen benchmark."""
-    p, std = found["parameters"], found["parameter_std"]
-    units = {
-        "m_kg": "kg",
-        "c_N_s_per_m": "N s/m",
-        "k_N_per_m": "N/m",
-        "alpha_N_per_m": "N/m",
-        "g": "",
-        "d": "",
-        "nu": "",
-    }
-    products = ", ".join(
-        f"{name} {value:.4g}" for name, value in zip(("gamma", "delta"), found["beta_gamma_beta_delta"], strict=True)
-    )
-    rows = [[f"published: {name}", short(value)] for name, value in found["published_rmse_m"].items()]
-    rows += [
-        ["**this model**, band-limited force, 20 steps a sample", f"**{short(found['rmse_m'])}**"],
-        ["the same, 40 steps a sample", short(found["rmse_m_40_steps"])],
-        ["the same with the force held between samples", short(found["rmse_m_held_input"])],
-    ]
-    return [
-        "# Simulated by others: the Bouc-Wen benchmark\n",
-        "Noël and Schoukens' hysteretic benchmark: `m y'' + c y' + k y + z = u`, `z' = alpha y' - beta (gamma |y'| "
-        "|z|^(nu-1) z + delta y' |z|^nu)`. All seven parameters come from the noisy training periods in "
-        f"{found['seconds']:.0f} s; their fit leaves {found['training_rmse_m']:.3g} m against a noise of the mean "
-        f"periods of {found['training_noise_m']:.3g} m.\n",
-        table(["forward prediction of the test multisine", "RMSE / m"], rows),
-        table(
-            ["parameter", "found", "standard deviation"],
-            [
-                [name.split("_")[0], f"{p[name]:.6g} {unit}", f"{100.0 * s:.2g} %" if unit else f"{s:.2g}"]
-                for (name, unit), s in zip(units.items(), std, strict=True)
-            ],
-        ),
-        f"Products of beta: {products}. RMS of the residual by band: "
-        + ", ".join(f"{name} {value:.2g} m" for name, value in found["residual_rms_m"].items())
-        + ".\n",
-        images(pictures, "benchmark"),
-    ]
-
-
 INTRODUCTION = """\
 # The chapter reproduced
 
@@ -464,6 +407,13 @@ on simulated stages: compare patterns, not digits. Why they differ, and which ch
 on the page *The chapter reproduced* of the documentation. `published` columns are the chapter's numbers. Errors are MAE
 (2.43) and RMSE (2.44) in percent of the motion range, unless stated otherwise.
 """
+
+
+#: What takes the place of a section that this report had.
+BENCHMARK = (
+    "The Bouc-Wen benchmark (Noël and Schoukens, 2016) is no longer in this report: `dehyst diagnose` finds and "
+    "measures its hysteresis, see the page *Diagnosis*.\n"
+)
 
 
 def report(numbers: Numbers) -> str:
@@ -479,11 +429,10 @@ def report(numbers: Numbers) -> str:
     for name, ours in numbers["presets"].items():
         parts.append(f"# Stage `{name}`\n")
         parts += models_section(ours, theirs, pictures[name]) + control_section(ours, theirs, pictures[name])
-    stack, benchmark = numbers["picma_stack"], numbers["boucwen_benchmark"]
-    parts += stack_section(stack, pictures["measured"]) if stack else []
-    parts += benchmark_section(benchmark, pictures["measured"]) if benchmark else []
-    if stack is None or benchmark is None:
-        parts.append("Measured data were not found; set `DEHYST_DATA` to the folder that holds them.\n")
+    stack = numbers["picma_stack"]
+    nothing = ["Measured data were not found; set `DEHYST_DATA` to the folder that holds them.\n"]
+    parts += stack_section(stack, pictures["measured"]) if stack else nothing
+    parts.append(BENCHMARK)
     return "\n".join(part for part in parts if part)
 
 
@@ -502,8 +451,6 @@ def write_study(study: Study, out: Path, progress: Callable[[str], None] = lambd
     pictures["measured"] = {}
     if study.stack is not None:
         pictures["measured"]["stack"] = stack_figure(out / "measured_stack.png", study.stack).name
-    if study.benchmark is not None:
-        pictures["measured"]["benchmark"] = benchmark_figure(out / "boucwen_benchmark.png", study.benchmark).name
     numbers["pictures"] = pictures
     (out / "tables.json").write_text(json.dumps(numbers, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     (out / "report.md").write_text(report(numbers), encoding="utf-8")

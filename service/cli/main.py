@@ -92,74 +92,65 @@ class Command(NamedTuple):
     compiles: bool = False
 
 
-def _command(module: str, group: str, help_line: str, *extras: str, compiles: bool = False) -> Command:
-    return Command(f"dehyst.service.cli.commands.{module}", group, help_line, extras, compiles)
-
-
+#: The commands by group, with one line of help each.
+_HELP: Final = {
+    SERVING: {
+        "serve": "serve the inverse models of a stage over zenoh, and keep learning",
+        "query": "ask a running service for voltages",
+        "stage": "run a simulated stage as a process on zenoh",
+        "router": "forward messages between stages, services and clients on several hosts",
+        "view": "stream a running service to the Rerun viewer or into an .rrd file",
+    },
+    OPERATING: {
+        "status": "show a live table of all axes and instances that serve",
+        "metrics": "serve the status of all axes as metrics for Prometheus",
+        "freeze": "stop an axis from learning, until it is thawed",
+        "thaw": "let a frozen axis learn again",
+        "rollback": "set the model of an axis back to a checkpoint",
+        "checkpoints": "list the checkpoints of an axis",
+        "select": "choose the model that answers where a query names none",
+        "retune": "tune the learning model's hyper-parameters anew, in the background",
+        "ask-diagnosis": "let a running service diagnose its recent samples, in the background",
+        "epics": "show an axis as EPICS process variables, and take commands",
+        "access": "make the certificates, passwords and access rules for more than one machine",
+    },
+    IDENTIFICATION: {
+        "commission": "move a stage through its adapter, and identify it",
+        "identify": "identify the inverse models of a stage from a recording",
+        "export": "write a model as C, tables and an FMU, for use without the service",
+        "look": "show what a file holds, and the command that would use it",
+        "replay": "run the learner over a recording offline, with its decisions and errors",
+        "diagnose": "name the effects in a recording that the simulation lacks, and what each explains",
+        "modes": "find the modes of a stage in periodic recordings, and how they soften with amplitude",
+    },
+    OTHER: {
+        "completion": "print the completion script of a shell",
+    },
+}
+#: Modules that do not have the name of their command.
+_MODULES: Final = {
+    **dict.fromkeys(
+        ("freeze", "thaw", "rollback", "checkpoints", "select", "retune", "ask-diagnosis"), "cli.commands.operate"
+    ),
+    "epics": "adapters.epics", "commission": "commissioning.command", "export": "export.command",
+}  # fmt: skip
+_EXTRAS: Final[dict[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("serve", "stage", "commission", "identify", "replay"), (SERVE,)),
+    **dict.fromkeys(("look", "diagnose", "modes"), (LAB,)),
+    "view": (VIEWER,),
+}
+_COMPILES: Final = frozenset({"serve", "stage", "commission", "identify", "replay", "diagnose", "modes"})
 #: The commands that need nothing but the service. `lab.cli` adds the experiments.
-COMMANDS: Final[dict[str, Command]] = {
-    "serve": _command(
-        "serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning", SERVE, compiles=True
-    ),
-    "query": _command("query", SERVING, "ask a running service for voltages"),
-    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh", SERVE, compiles=True),
-    "router": _command("router", SERVING, "forward messages between stages, services and clients on several hosts"),
-    "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file", VIEWER),
-    "status": _command("status", OPERATING, "show a live table of all axes and instances that serve"),
-    "metrics": _command("metrics", OPERATING, "serve the status of all axes as metrics for Prometheus"),
-    "freeze": _command("operate", OPERATING, "stop an axis from learning, until it is thawed"),
-    "thaw": _command("operate", OPERATING, "let a frozen axis learn again"),
-    "rollback": _command("operate", OPERATING, "set the model of an axis back to a checkpoint"),
-    "checkpoints": _command("operate", OPERATING, "list the checkpoints of an axis"),
-    "select": _command("operate", OPERATING, "choose the model that answers where a query names none"),
-    "retune": _command("operate", OPERATING, "tune the learning model's hyper-parameters anew, in the background"),
-    "ask-diagnosis": _command(
-        "operate", OPERATING, "let a running service diagnose its recent samples, in the background"
-    ),
-    "epics": Command(
-        "dehyst.service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"
-    ),
-    "access": _command(
-        "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
-    ),
-    "commission": Command(
-        "dehyst.service.commissioning.command",
-        IDENTIFICATION,
-        "move a stage through its adapter, and identify it",
-        (SERVE,),
-        True,
-    ),
-    "identify": _command(
-        "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
-    ),
-    "export": Command(
-        "dehyst.service.export.command",
-        IDENTIFICATION,
-        "write a model as C, tables and an FMU, for use without the service",
-    ),
-    "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
-    "replay": _command(
-        "replay",
-        IDENTIFICATION,
-        "run the learner over a recording offline, with its decisions and errors",
-        SERVE,
-        compiles=True,
-    ),
-    "diagnose": _command(
-        "diagnose",
-        IDENTIFICATION,
-        "name the effects in a recording that the simulation lacks, and what each explains",
-        LAB,
-        compiles=True,
-    ),
-    "modes": _command(
-        "modes",
-        IDENTIFICATION,
-        "find the modes of a stage in periodic recordings, and how they soften with amplitude",
-        LAB,
-        compiles=True,
-    ),
-    "completion": _command("completion", OTHER, "print the completion script of a shell"),
+COMMANDS: Final = {
+    name: Command(
+        f"dehyst.service.{_MODULES.get(name, f'cli.commands.{name}')}",
+        group,
+        line,
+        _EXTRAS.get(name, ()),
+        name in _COMPILES,
+    )
+    for group, lines in _HELP.items()
+    for name, line in lines.items()
 }
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from dehyst.sim.recordings import Recording, Repaired
 
 #: Names of the models, in the order in which they are identified and shown.
 NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
+#: How the baselines are fitted.
+_FITS: Final[dict[str, Callable[..., Any]]] = {"linear": fit_linear, "bouc_wen": fit_bouc_wen, "mpi": fit_mpi}
 #: Share at the beginning of a separate test recording that is not scored: it only settles the models' memory.
 SETTLE_SHARE = 0.05
 #: Fewest samples for identification, and for scoring.
@@ -160,19 +162,14 @@ def identify_one(
     """
     part = _fitted_part(name, len(u_V), dt_s, most)
     u_thin, y_thin, dt_thin = u_V[part], y_um[part], dt_s * part.step
-    if name == "linear":
-        return fit_linear(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
-    if name == "bouc_wen":
-        return fit_bouc_wen(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
-    if name == "mpi":
-        return fit_mpi(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
-    inputs = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
-    if name not in inputs:
+    if name in _FITS:
+        model: InverseModel = _FITS[name](u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
+        return model
+    if name not in NAMES:
         raise FieldError("models", repr(name), f"some of {', '.join(NAMES)}")
     config = IdentifyConfig(n=max(10, min(n, len(u_V) // 2)), rows=max(100, most))
-    if name == "lssvm_frozen":
-        return identify_lssvm(u_V, y_um, dt_s, inputs="two", config=config, name=name)[0]
-    return identify_lssvm(u_V, y_um, dt_s, inputs="memory", config=config, name=name)[0]
+    inputs: Literal["two", "memory"] = "two" if name == "lssvm_frozen" else "memory"
+    return identify_lssvm(u_V, y_um, dt_s, inputs=inputs, config=config, name=name)[0]
 
 
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:

@@ -145,33 +145,26 @@ def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float,
 def chapter_reference(range_um: float, duration_s: float = 10.0) -> Reference:
     """(2.45) in displacement: its decaying sweep scaled to 90 % of the motion range."""
     scale = _TOP * range_um / 2.0
-
-    def formula(t: FloatArray) -> FloatArray:
-        wave = np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - np.pi) + 1.0
-        return np.asarray(scale * np.exp(-0.14 * t) * wave, dtype=np.float64)
-
-    return from_formula(formula, duration_s)
+    return from_formula(
+        lambda t: scale * np.exp(-0.14 * t) * (np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - np.pi) + 1.0), duration_s
+    )
 
 
 def training_reference(range_um: float, duration_s: float = 10.0) -> Reference:
     """(2.37) in displacement, scaled to 90 % of the range: the motion of the training record."""
     scale = _TOP * range_um / 2.0
-
-    def formula(t: FloatArray) -> FloatArray:
-        wave = np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 0.5 * np.pi) + 1.0
-        return np.asarray(scale * np.exp(-0.11 * t) * wave, dtype=np.float64)
-
-    return from_formula(formula, duration_s)
+    return from_formula(
+        lambda t: scale * np.exp(-0.11 * t) * (np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 0.5 * np.pi) + 1.0),
+        duration_s,
+    )
 
 
 def sine_reference(range_um: float, frequency_Hz: float = 5.0, duration_s: float = 4.0) -> Reference:
     """A sine from 0 to 80 % of the range, whose amplitude rises smoothly over the first half second."""
-
-    def formula(t: FloatArray) -> FloatArray:
-        size = blend_step(np.clip(t / 0.5, 0.0, 1.0))[0]
-        return np.asarray(0.4 * range_um * size * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t)), dtype=np.float64)
-
-    return from_formula(formula, duration_s)
+    omega = 2.0 * np.pi * frequency_Hz
+    return from_formula(
+        lambda t: 0.4 * range_um * blend_step(np.clip(t / 0.5, 0.0, 1.0))[0] * (1.0 - np.cos(omega * t)), duration_s
+    )
 
 
 def answered_reference(record: Record) -> Reference:

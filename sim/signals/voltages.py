@@ -56,9 +56,11 @@ def growing_triangles(
     """Triangles from 0 V of growing amplitude at a constant rate, as in Fig. 2.2. Raises InputError on bad values."""
     if not amplitudes_V or min(amplitudes_V) <= 0.0 or rate_V_per_s <= 0.0:
         raise InputError(f"amplitudes_V, rate_V_per_s: got {amplitudes_V}, {rate_V_per_s}, expected positive numbers")
-    corners_V = [0.0]
-    for amplitude in amplitudes_V:
-        corners_V += [amplitude, 0.0]
+    return _straight([0.0, *(corner for amplitude in amplitudes_V for corner in (amplitude, 0.0))], rate_V_per_s, dt_s)
+
+
+def _straight(corners_V: list[float], rate_V_per_s: float, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Straight from corner to corner at one rate."""
     corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
     t = sample_times(float(corners_s[-1]), dt_s)
     return t, np.interp(t, corners_s, corners_V)
@@ -81,26 +83,13 @@ def sine(
     return t, low_V + (high_V - low_V) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t))
 
 
-def minor_loops(
-    low_V: float = 1.0,
-    high_V: float = 7.0,
-    loops: int = 4,
-    inner_V: float = 1.5,
-    rate_V_per_s: float = 6.0,
-    dt_s: float = 1e-3,
-) -> tuple[FloatArray, FloatArray]:
-    """A large loop from 0 V with ``loops`` minor loops of depth ``inner_V`` on each branch."""
-    levels = np.linspace(low_V, high_V, loops + 2)[1:-1]
-    corners_V = [0.0, low_V]
-    for level in levels:
-        corners_V += [float(level), float(level) - inner_V]
-    corners_V.append(high_V)
-    for level in levels[::-1]:
-        corners_V += [float(level), float(level) + inner_V]
-    corners_V += [low_V, 0.0]
-    corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
-    t = sample_times(float(corners_s[-1]), dt_s)
-    return t, np.interp(t, corners_s, corners_V)
+def minor_loops(loops: int = 4, dt_s: float = 1e-3) -> tuple[FloatArray, FloatArray]:
+    """A large loop from 0 V, between 1 and 7 V, with ``loops`` minor loops of 1.5 V on each branch, at 6 V/s."""
+    low_V, high_V, inner_V = 1.0, 7.0, 1.5
+    levels = np.linspace(low_V, high_V, loops + 2)[1:-1].tolist()
+    up = [corner for level in levels for corner in (level, level - inner_V)]
+    down = [corner for level in levels[::-1] for corner in (level, level + inner_V)]
+    return _straight([0.0, low_V, *up, high_V, *down, low_V, 0.0], 6.0, dt_s)
 
 
 def multitone(

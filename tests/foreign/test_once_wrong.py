@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.foreign import LARGE_S, NAMED_S, run_one
-from dehyst.lab.rehearsal import RehearsalConfig, identify, run_healthy
+from dehyst.lab.rehearsal import Event, RehearsalConfig, identify
+from dehyst.lab.rehearsal.rehearsal import _Course
 from tests.foreign.plants import random_plant
 
 
@@ -47,8 +48,9 @@ def test_a_right_model_that_lies_at_its_bound_on_one_branch_is_served() -> None:
     factory = random_plant(90_000_004, as_drawn=True)
     low_V, high_V = factory.traits.excite_V
     config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=20, snapshot_every=20)
-    run = run_healthy(factory, identify(factory, config), config, 5.0, 90_000_004)
-    assert run.troubles == ()
+    nothing = Event("none", "none", 4.0)
+    course = _Course.prepared(factory, identify(factory, config), config, nothing, 5.0, 90_000_004)
+    assert course.run_adaptive(course.new_plant())[0].troubles == ("",)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.baselines.bouc_wen.mechanical import MechanicalBoucWen
 from dehyst.sim.diagnosis.diagnose import diagnose_prepared
 from dehyst.sim.diagnosis.export import export_stage
 from dehyst.sim.diagnosis.prepare import prepare
@@ -14,6 +13,7 @@ from dehyst.sim.effects import effect, simulate
 from dehyst.sim.fitting.dynamics import Dynamics, ForceLoop, respond
 from dehyst.sim.fitting.hysteresis_loops import plays_nested
 from dehyst.sim.recordings import Recording
+from tests.mechanical_oscillator import MechanicalBoucWen
 from tests.sim.diagnosis.plays import plays
 
 DT = 1.0 / 750.0
