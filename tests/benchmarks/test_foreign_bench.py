@@ -11,13 +11,11 @@ import pytest
 
 from benchmarks import foreign
 from benchmarks.foreign import (
-    LINE,
     goals,
     main,
     read,
 )
-from dehyst.lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
-from tests.foreign.plants import random_plant
+from dehyst.lab.rehearsal.disturbance import EVENT_KINDS, draw
 
 
 def run(name: str, **given: Any) -> dict[str, Any]:
@@ -73,16 +71,6 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
     assert "median over 6 runs" in told_goals
 
 
-def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
-    events = [draw(name, seed, 4.0) for name, seed in LINE]
-    assert all(random_plant(seed).traits.dt_s >= 1e-3 for _, seed in LINE)
-    steps = [event.size for event in events if event.name == "gain_at_once"]
-    assert min(steps) < 0.0 < max(steps)
-    assert random_plant(dict(LINE)["knock"]).traits.modes
-    assert sum(event.category == SENSOR for event in events) == 3
-    assert len({seed for _, seed in LINE}) == len(LINE) == 12
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -99,28 +87,6 @@ def test_what_cannot_be_asked_for_is_refused(
     with pytest.raises(SystemExit):
         main(arguments)
     assert words in capsys.readouterr().err
-
-
-def test_controllers_are_shown_by_median_and_worst(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def stage(seed: int, moving_pct: float | None) -> dict[str, Any]:
-        one = {
-            "way": "I",
-            "age": 5,
-            "moving_pct": moving_pct,
-            "first_second_pct": 0.2,
-            "lines_pct": [4.0, 3.0, 2.0, 1.0],
-        }
-        return {"seed": seed, "ages": [5], "hysteresis": "plays", "cpu_s": 1.0, "controllers": [one]}
-
-    file = tmp_path / "controllers.jsonl"
-    file.write_text(
-        "".join(json.dumps(stage(k, 0.1 * k)) + "\n" for k in (1, 2, 4))
-        + json.dumps({"seed": 5, "ages": [5], "failed": "ValueError: no"})
-    )
-    assert main(["--table", str(file)]) == 1
-    said = capsys.readouterr().out
-    assert "3 stages" in said
-    assert "| an integrator alone | 5 | 0.200 / 0.400 | 0.200 / 0.200 | 4.000 / 4.000 |" in said
 
 
 def healthy_run(seed: int, **given: Any) -> dict[str, Any]:

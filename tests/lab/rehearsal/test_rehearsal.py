@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.lab.rehearsal import CLASSES, EVENT_KINDS, SENSOR, Event, RehearsalConfig, draw, factory_of, rehearse
-from dehyst.lab.rehearsal.disturbance import INTACT, MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from dehyst.lab.rehearsal import EVENT_KINDS, SENSOR, Event, RehearsalConfig, factory_of, rehearse
+from dehyst.lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
 from dehyst.lab.rehearsal.outcome import outcome
 from dehyst.lab.rehearsal.plant import FunctionPlant, Plant, run_checked
-from dehyst.lab.rehearsal.reference import Excursion, RandomReference, ReferenceRequest
+from dehyst.lab.rehearsal.reference import RandomReference, ReferenceRequest
 from dehyst.lab.rehearsal.rehearsal import remarks, table
 from dehyst.lab.rehearsal.runs import LoopRecord
 from dehyst.service.answers.guard import Limits
@@ -107,35 +107,7 @@ def test_the_reference_belongs_together_and_keeps_to_its_band(seed: int) -> None
     assert np.array_equal(RandomReference(wish)(t_s[:100])[0], y[:100])
 
 
-def test_an_excursion_goes_there_and_comes_back_smoothly() -> None:
-    wish = ReferenceRequest(0.0, 10.0, 90.0, 8.0, 1)
-    base = RandomReference(wish)
-    t_s = np.arange(8000) * 1e-3
-    y, v, _ = Excursion(base, 105.0, 3.0, 4.0)(t_s)
-    assert np.allclose(y[(t_s > 3.31) & (t_s < 3.69)], 105.0)
-    outside = (t_s < 3.0) | (t_s > 4.0)
-    assert np.array_equal(y[outside], base(t_s)[0][outside])
-    assert np.abs(np.gradient(y, 1e-3) - v)[2:-2].max() < 1e-2 * np.abs(v).max()
-
-
 # What happens.
-
-
-def test_every_class_is_drawn_by_its_seed_and_says_what_it_is() -> None:
-    for name in CLASSES:
-        one = draw(name, 5, 3.0)
-        assert one == draw(name, 5, 3.0)
-        assert one.text
-        assert one.category == EVENT_KINDS[one.kind].category
-        assert json.loads(json.dumps(one.size)) == one.size
-    assert {EVENT_KINDS[kind].category for kind in ("stuck", "stuck_noise", "sensor_gain", "sign", "foreign")} == {
-        SENSOR
-    }
-    assert {kind.category for kind in EVENT_KINDS.values()} == {INTACT, SENSOR}
-    with pytest.raises(InputError, match="some of none"):
-        draw("thunder", 0, 3.0)
-    with pytest.raises(InputError, match="2 s or later"):
-        draw("knock", 0, 1.0)
 
 
 def stood(event: Event, u_V: np.ndarray, block: int = 7) -> np.ndarray:

@@ -160,20 +160,6 @@ def test_commands_leave_within_the_limits_and_say_so_and_references_arrive(clien
         subscriber.undeclare()
 
 
-def test_the_follower_guards_what_leaves_too(client: Client) -> None:
-    follower = client.follow("linear")
-    low = follower.point(12.0)
-    assert low == pytest.approx(1.0)
-    assert follower.point(90.0) == pytest.approx(low + 2.0)
-    for y_um, v in ((200.0, 0.0), (float("nan"), 0.0), (40.0, float("inf"))):
-        with pytest.raises(InputError):
-            follower.point(y_um, v)
-        with pytest.raises(InputError):
-            follower.trajectory([y_um, y_um], [v, v])
-    with pytest.raises(RefusedError, match="sorcery"):
-        client.follow("sorcery")
-
-
 @pytest.mark.parametrize("wrong", ["40", [1.5]], ids=repr)
 def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> None:
     for field, ask in (

@@ -363,17 +363,6 @@ def test_a_tilt_is_read_in_microradians_and_says_so(tmp_path: Path, unit: str, f
     assert_read(second_try(tmp_path / "b.csv", {"y=UNIT": f"y={unit}"})[0])
 
 
-def test_a_displacement_goes_before_an_angle_and_is_no_angle(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t (s),U (V),Tilt (mrad),Z (um)\n" + rows("{t:.3f},{u:.5f},{v:.6f},{y:.5f}\n"))
-    recording = read(tmp_path / "a.csv")
-    assert_read(recording)
-    assert recording.y_unit == "µm"
-    (tmp_path / "b.csv").write_text("t (s),U (V),Phase (deg)\n" + rows("{t:.3f},{u:.5f},{v:.6f}\n"))
-    with pytest.raises(MissingError) as caught:
-        read(tmp_path / "b.csv")
-    assert caught.value.options == ("--file y=FILE",)
-
-
 def test_the_days_of_a_spreadsheet_are_a_time(tmp_path: Path) -> None:
     book = openpyxl.Workbook()
     book.active.append(["Date", "Drive", "Sensor"])

@@ -116,9 +116,6 @@ def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: lis
     assert join.take(everything=True) is None
 
 
-# -- planes ------------------------------------------------------------------------------------------------------
-
-
 # -- scene -------------------------------------------------------------------------------------------------------
 
 
@@ -186,17 +183,6 @@ def test_diagnostics_become_curves_rates_and_the_window() -> None:
     assert positions.shape == (3, 2)
     assert np.all(np.diff(positions[:, 0]) > 0)
     assert np.all(np.diff(positions[:, 1]) < 0), "upwards on a screen whose y points down"
-
-
-def test_the_band_lies_two_sigma_around_the_voltage() -> None:
-    samples = tracking("lssvm_adaptive", 0.0, n=1001)
-    memory = drawn(
-        [samples, Diagnostics(0.25, 250, {"std_V": 0.02}), Diagnostics(0.5, 500, {"u_V": 3.0, "std_V": 0.1})]
-    )
-    u_V = float(samples.u_V[250])
-    assert memory.values(style.BAND_HIGH) == pytest.approx([u_V + 0.04, 3.2])
-    assert memory.values(style.BAND_LOW) == pytest.approx([u_V - 0.04, 2.8])
-    assert memory.values(style.SIGMA) == pytest.approx([20.0, 100.0])
 
 
 @pytest.mark.parametrize(
