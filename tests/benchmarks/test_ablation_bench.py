@@ -14,13 +14,17 @@ import pytest
 
 from benchmarks import ablation
 from benchmarks.ablation import (
+    ORDER,
+    RULES,
     Constant,
     Numbers,
     Settings,
     ablate,
     all_constants,
     constants_of,
+    field_variants,
     readers_of,
+    rule_variants,
     shift,
     table,
     variants_of,
@@ -51,6 +55,15 @@ def test_the_constants_of_a_module_are_its_numbers_and_tuples_of_numbers() -> No
     assert found["m.SHARE[1]"].shifted(2.0) == (0.6, 3.4)
     assert found["m.TURNS"].shifted(2.0) == (0.0, 0.2, 0.8)
     assert (found["m.COUNT"].shifted(0.5), found["m.BELOW"].shifted(2.0)) == (2, -5.0)
+
+
+def test_every_module_of_the_learner_is_looked_through_and_every_rule_replaces_what_is_there() -> None:
+    modules = {constant.module.rpartition(".")[2] for constant in all_constants()}
+    assert modules == {*ORDER, "kernel_window"}
+    assert [rule.name for rule in RULES if not rule.places] == [
+        "roll back to a mark", "a sudden change is detected",
+    ]  # these replace a number # fmt: skip
+    assert len({variant.name for variant in (*rule_variants(), *field_variants())}) > 80
 
 
 def text_of(places: Collection[tuple[str, int]]) -> set[str]:
@@ -95,6 +108,14 @@ def test_a_shift_reaches_compiled_code_and_what_calls_it() -> None:
 
     assert in_a_process(shifted) == np.inf
     assert np.isfinite(level_of(swing, 1e-3).std)
+
+
+def test_a_shift_reaches_importers() -> None:
+    def shifted() -> tuple[int, int]:
+        shift(constant("sensor_trust.STILL_STEPS"), 40)
+        return ablation.intake.STILL_STEPS, ablation.sensor_trust.STILL_STEPS
+
+    assert in_a_process(shifted) == (40, 40)
 
 
 # ---- comparison
