@@ -86,18 +86,3 @@ def test_a_rest_lasts_as_long_as_it_is_to_and_the_motion_goes_on(seed: int) -> N
         assert not a[still].any()
         assert y[-1] != y[still][0]
         assert np.abs(v[t_s >= begin_s][:2000]).max() > 0.0
-
-
-def test_seeds_draw_motions_and_a_name_may_fix_the_frequency() -> None:
-    t_s = times(50_000, 1e-3)[:5000]
-    assert np.array_equal(made("noise", 1, t_s).y_um, made("noise", 1, t_s).y_um)
-    assert not np.array_equal(made("noise", 1, t_s).y_um, made("noise", 2, t_s).y_um)
-    drawn = [MOTIONS["raster"].drawn_Hz(seed) for seed in range(200)]
-    assert 1.0 <= min(drawn) < 1.5
-    assert 40.0 < max(drawn) <= 50.0
-    assert motion("raster:10").drawn_Hz(7) == 10.0
-    for wrong in ("raster:0", "raster:nan", "raster:x"):
-        with pytest.raises(ValueError, match=r"raster|convert"):
-            motion(wrong)
-    with pytest.raises(KeyError):
-        motion("circle")

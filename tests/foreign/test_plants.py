@@ -120,21 +120,3 @@ def test_changes_are_taken_and_scale_as_told() -> None:
     assert true_um[-1] - before_um == pytest.approx(-2.5, rel=1e-9)
     assert not factory().change(Change("knock", 1.0))  # nothing there that rings
     assert not factory().change(Change("unheard of", 1.0))
-
-
-def test_a_payload_lowers_the_frequency_and_a_lag_slows() -> None:
-    heavy = ringing()()
-    heavy.run(np.full(2000, 4.0))
-    assert heavy.change(Change("payload", 1.0))
-    true_um, _ = heavy.run(np.full(4096, 4.5))
-    swing = true_um[1:] - true_um[-500:].mean()
-    spectrum = np.abs(np.fft.rfft(swing * np.hanning(swing.size)))
-    assert np.fft.rfftfreq(swing.size, 5e-4)[spectrum.argmax()] == pytest.approx(200.0 / np.sqrt(2.0), abs=1.0)
-    factory = with_traits(ringing(), modes=())
-    slow, plain = factory(), factory()
-    for plant in (slow, plain):
-        plant.run(np.full(2000, 4.0))
-    assert slow.change(Change("lag", 5e-3))
-    for plant, share in ((slow, 1.0 - np.exp(-1.0)), (plain, 1.0)):
-        true_um, _ = plant.run(np.full(2000, 4.5))
-        assert (true_um[10] - true_um[0]) / (true_um[-1] - true_um[0]) == pytest.approx(share, abs=0.1)

@@ -25,7 +25,7 @@ from dehyst.service.identification.recording_options import add_mapping_argument
 from dehyst.sim.recordings import Recording, read
 from dehyst.sim.recordings.columns import ColumnMap, MissingError
 
-N, DT_S = 3000, 1e-3
+N, DT_S = 1500, 1e-3
 T_S = np.arange(N) * DT_S
 U_V = 5.0 - 4.5 * np.cos(2 * np.pi * 1.3 * T_S)
 # The displacement lags the voltage, as in a stage.
