@@ -36,20 +36,6 @@ def test_a_clock_that_is_set_for_good_goes_on_after_some_samples(off_s: float, b
 ABSURD = [1e300, -1e18, 2.0**62, 1e10, math.inf, -math.inf, math.nan]
 
 
-@pytest.mark.parametrize("t_s", ABSURD)
-@pytest.mark.parametrize("at", [0, 1, 50])
-def test_a_time_that_no_clock_shows_is_none_and_poisons_nothing(t_s: float, at: int) -> None:
-    clock = SampleClock(DT_S)
-    run(clock, 0, at)
-    assert math.isnan(clock.take(at, t_s, False))
-    assert not clock.in_doubt
-    assert run(clock, at + 1, 50) == [k * DT_S for k in range(at + 1, at + 51)]
-    assert clock.sets == 0
-    for k in range(at + 51, at + 551):
-        clock.take(k, t_s, False)
-    assert run(clock, at + 551, 50) == [k * DT_S for k in range(at + 551, at + 601)]
-
-
 @pytest.mark.parametrize("t_s", [*ABSURD, -7.0, 1e6])
 @pytest.mark.parametrize("at", [0, 700])
 def test_an_axis_learns_on_at_once_after_a_single_absurd_time(

@@ -22,7 +22,7 @@ from dehyst.service.protocol.container import decode_body, encode_body
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
 from dehyst.service.protocol.model import decode_model, encode_model
-from dehyst.service.protocol.query import Answer, decode_query, encode_query, encode_reply
+from dehyst.service.protocol.query import decode_query, encode_query
 
 # --- Payloads: what is encoded comes back, and nothing malformed gets through.
 
@@ -70,20 +70,6 @@ def test_queries_come_back(
     assert (query.model, query.as_of) == (model, as_of)
     assert query.u_before_V == before or (math.isnan(before) and math.isnan(query.u_before_V))
     assert query.y_um.flags.writeable  # compiled loops would be compiled once more for what is read-only
-
-
-def test_the_layout_is_that_of_the_page() -> None:
-    """Byte by byte, so that a change of the format cannot go unnoticed."""
-    assert wire.encode_samples(7, 0.5, 1.0, 2.0) == struct.pack("<BBHIqddd", 1, 1, 0, 1, 7, 0.5, 1.0, 2.0)
-    assert wire.encode_command(9, [1.0, 2.0]) == struct.pack("<BBHIqdd", 1, 2, 0, 2, 9, 1.0, 2.0)
-    assert wire.encode_reference(9, 1.5) == struct.pack("<BBHIqd", 1, 3, 0, 1, 9, 1.5)
-    assert encode_query(1.0, 2.0, 3.0, [4.0], "mpi", 5, 6.0) == (
-        struct.pack("<BBHIqdII", 1, 4, 3, 1, 5, 6.0, 1, 3) + struct.pack("<dddd", 4.0, 1.0, 2.0, 3.0) + b"mpi"
-    )
-    reply = Answer(np.ones(1), np.zeros(1), np.full(1, 4, np.uint8), np.full(1, 9.0), 5, "a", tracked_memory=True)
-    assert encode_reply(reply) == (
-        struct.pack("<BBHIqII", 1, 5, 2, 1, 5, 1, 1) + struct.pack("<ddd", 1.0, 0.0, 9.0) + b"\x04a"
-    )
 
 
 @pytest.mark.parametrize(

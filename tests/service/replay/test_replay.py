@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +30,6 @@ from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
-DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
 
 
 @pytest.fixture(scope="module")
@@ -205,36 +202,6 @@ def test_the_command_says_what_it_lacks(
     assert "--learn" in capsys.readouterr().err
     assert main([*base, "--model", str(model_file), "--dt-s", "0.01"]) == 2
     assert "sample time" in capsys.readouterr().err
-
-
-def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From the identified 1 Hz recording to the ramped sine: the command's whole way on measured data."""
-    folder = DATA / "picma_stack"
-    if not folder.exists():
-        pytest.skip(f"measured data missing: {folder.name}; set DEHYST_DATA to the folder that holds it")
-    config, model = tmp_path / "learner.toml", tmp_path / "stack.npz"
-    config.write_text("window = 300\n", encoding="utf-8")
-    options = ["--sensor-late", "1", "--json"]
-    identify = ["identify", str(folder / "model_sine_1hz.csv"), "--out", str(model), "--models", "lssvm_adaptive"]
-    assert main([*identify, "--no-picture", "--support", "300", *options]) == 0
-    capsys.readouterr()
-    data = str(folder / "test_ramped_sine_ff.csv")
-    command = ["replay", data, "--config", str(config), "--model", str(model), "--out", str(tmp_path / "out")]
-    begin_s = time.process_time()
-    assert main([*command, *options]) == 0
-    took_s = time.process_time() - begin_s
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["scored"] > 14_000
-    assert took_s < 0.5 * printed["duration_s"]
-    assert printed["gates"]["learnt"] > 0
-    assert printed["frozen"]["mae_pct"] < 5.0
-    # What it is for: over the second half the model that learns foretells better than the one it began as.
-    second = printed["over_time"][10:]
-    adaptive, frozen = (float(np.mean([part[name]["mae_pct"] for part in second])) for name in ("adaptive", "frozen"))
-    assert adaptive < 0.4 * frozen
-    for name in ("errors.png", "gates.png"):
-        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
-    assert len(decisions(tmp_path / "out" / "gates.csv")) == printed["samples"]
 
 
 @pytest.mark.parametrize("missing", [3, 60])

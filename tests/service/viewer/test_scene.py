@@ -17,9 +17,8 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
 from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
-from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
-from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
-from dehyst.service.viewer.rerun_sink import cut, in_order
+from dehyst.service.viewer.plane import Plane
+from dehyst.service.viewer.records import Diagnostics, IntArray, SceneConfig, Tracking
 from dehyst.service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")
@@ -75,12 +74,6 @@ def drawn(records: Sequence[Any], **config: Any) -> Memory:
     return memory
 
 
-def data(plane: Plane, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions in the box (n, 2) back to data: the inverse of `Plane.points`."""
-    x = positions[:, 0] / WIDTH * (plane.x_limits[1] - plane.x_limits[0]) + plane.x_limits[0]
-    return x, positions[:, 1] / -HEIGHT * (plane.y_limits[1] - plane.y_limits[0]) + plane.y_limits[0]
-
-
 # -- joining -----------------------------------------------------------------------------------------------------
 
 
@@ -127,40 +120,6 @@ def test_errors_in_um_and_percent_of_the_range_are_those_of_the_samples() -> Non
     assert memory.values("mean_error_log10_pct/lssvm_adaptive") == pytest.approx(np.full(60, -1.0))
     # The reference is drawn once, not once a unit.
     assert len(memory.curves[style.REFERENCE]) == 3000
-
-
-def test_the_mean_error_is_that_of_the_last_half_second_however_the_samples_are_cut() -> None:
-    rng = np.random.default_rng(3)
-    whole = tracking("linear", 0.0, n=4000)
-    noisy = Tracking(
-        "linear", whole.seq, whole.t_s, whole.u_V, whole.y_um + rng.standard_normal(4000), whole.reference_um
-    )
-    at_once = drawn([noisy], range_um=60.0)
-    in_pieces = drawn(list(cut(noisy, 0.13)), range_um=60.0)
-    path = "mean_error_pct/linear"
-    assert in_pieces.times(path) == pytest.approx(at_once.times(path))
-    assert in_pieces.values(path) == pytest.approx(at_once.values(path))
-    t_s = at_once.times(path)[40]
-    last = (noisy.t_s > t_s - 0.5 + 1e-9) & (noisy.t_s <= t_s + 1e-9)
-    expected = 100.0 * np.abs(noisy.y_um - noisy.reference_um)[last].mean() / 60.0
-    assert at_once.values(path)[40] == pytest.approx(expected)
-
-
-def test_loops_before_and_after_a_change_are_those_of_their_time() -> None:
-    before = tracking("lssvm_adaptive", 0.0, n=3000)
-    after = tracking("lssvm_adaptive", 5.0, start_s=3.0, n=3000)
-    records = in_order([after, before, Event(3.0, 3000, "gain drops", change=True)])
-    memory = drawn(records, loop_s=1.0)
-    plane = memory.planes[style.LOOP_PLANE]
-    assert 3.0 <= memory.shapes[style.LOOP_BEFORE][0][0] < 3.5
-    # It stands still, and is drawn anew where the axes have grown.
-    u_V, y_um = data(plane, memory.shapes[style.LOOP_BEFORE][-1][1][0])
-    assert y_um == pytest.approx(11.0 * u_V), "nothing from after the change in it"
-    assert np.ptp(y_um) > 55.0
-    t_s, now = memory.shapes[style.LOOP_NOW][-1]
-    u_V, y_um = data(plane, now[0])
-    assert t_s > 5.5
-    assert y_um == pytest.approx(11.0 * u_V - 5.0)
 
 
 def test_diagnostics_become_curves_rates_and_the_window() -> None:

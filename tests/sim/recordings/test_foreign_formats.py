@@ -231,17 +231,6 @@ def test_two_files_with_a_time_each_must_agree(tmp_path: Path) -> None:
         read(main, ColumnMap(files={"y": fast}))
 
 
-def test_a_time_in_the_second_file_serves_both(tmp_path: Path) -> None:
-    main = write_npy(tmp_path / "u_V.npy", U)
-    other = write_text(tmp_path / "b.csv", "t_s,y_um", table=np.column_stack([T, Y]))
-    same(read(main, ColumnMap(files={"y": other})))
-    # By position, the time of one file is no time in a file that has the sensor there.
-    clock = write_text(tmp_path / "c.csv", table=np.column_stack([T, U]))
-    single = write_text(tmp_path / "d.csv", table=Y.reshape(-1, 1))
-    mapping = ColumnMap(columns={"t": "1", "u": "2"}, files={"y": single}, units={"t": "s", **UNITS})
-    same(read(clock, mapping))
-
-
 def test_a_missing_second_file_and_a_missing_column_in_it(tmp_path: Path) -> None:
     main = write_npy(tmp_path / "u_V.npy", U)
     with pytest.raises(InputError, match=r"none\.csv: cannot be read"):
