@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dehyst.lab.soak.fault_plan import FAULT_KINDS, make_plan
 from dehyst.lab.soak.judge import MEMORY_MB, TRACKING_PCT
 from dehyst.lab.soak.observed import FaultRecord, Observations
-from dehyst.lab.soak.report import draw, report, verdict_line
+from dehyst.lab.soak.report import verdict_line
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 
@@ -83,16 +81,3 @@ def test_memory_in_use_is_compared_with_that_after_the_warm_up(grows_mb: float, 
     found = verdict(healthy(1000, grows))
     assert found["invariants"]["memory"]["held"] is held
     assert verdict(healthy(700, grows))["not_judged"] == ["memory"], "less than ten minutes after the warm-up"
-
-
-def test_the_files_of_a_run_say_what_was_found(tmp_path: Path) -> None:
-    observed = healthy()
-    observed.faults[0].breaches.append("it went wrong")
-    observed.notes.append("a note")
-    found = verdict(observed)
-    text = report(found, observed, make_plan(40.0, 1, ("gap",)), interrupted=True)
-    assert text.startswith("# Soak: broken; not judged: memory (too short a run)\n")
-    for part in ("Interrupted", "- a note", "- **gap: it went wrong**", f"| gap | {FAULT_KINDS['gap'].what} | 1 |"):
-        assert part in text
-    draw(tmp_path / "soak.png", observed)
-    assert (tmp_path / "soak.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

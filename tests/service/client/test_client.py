@@ -23,11 +23,8 @@ from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import (
     BehindError,
     NoReplyError,
-    RefusedError,
     ReplyTimeoutError,
     SessionError,
-    error_from_json,
-    error_to_json,
 )
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE
@@ -257,15 +254,6 @@ def test_every_question_is_repeated_while_another_service_takes_over(free_port: 
             again.join()
             assert patient.retries > 0
             assert hasty.retries == 0
-
-
-def test_errors_keep_the_words_of_the_service() -> None:
-    refused = error_from_json(error_to_json(ValueError("no")))
-    assert isinstance(refused, RefusedError)
-    assert (refused.kind, str(refused)) == ("ValueError", "no")
-    assert isinstance(error_from_json(b"Timeout"), ReplyTimeoutError)
-    assert isinstance(error_from_json(b"\xff\xfe"), RefusedError)
-    assert isinstance(error_from_json(b"[1]"), RefusedError)
 
 
 def test_the_command_asks_a_running_service(

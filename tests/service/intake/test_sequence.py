@@ -55,6 +55,16 @@ def number(tracker: SequenceTracker) -> int:
     return tracker.number(tracker.last)
 
 
+def test_a_gap_is_taken_at_once_where_the_time_tells_of_it_or_is_none() -> None:
+    for t_s in (2.0, math.nan, math.inf):
+        tracker = begun()
+        assert tracker.take(2000, t_s) == IN_ORDER
+        assert tracker.lost == 1000
+    for missing, expected in ((MOST, IN_ORDER), (MOST + 1, AHEAD)):
+        tracker = begun()
+        assert tracker.take(1000 + missing, 1.0) == expected
+
+
 @pytest.mark.parametrize("outage_s", [1.002, 30.0, 86_000.0])
 def test_a_real_outage_is_borne_out_by_some_samples_and_its_numbers_are_lost(outage_s: float) -> None:
     tracker = begun()

@@ -46,6 +46,16 @@ def test_the_factor_settles_where_the_learner_keeps_up_and_nothing_is_dropped(
     assert factors[len(factors) // 2] >= expected
 
 
+@pytest.mark.parametrize(("rate_hz", "learnt"), [(100_000, 12_400), (100_000, 3500), (200_000, 12_400)])
+def test_a_queue_that_is_full_within_the_first_fraction_of_a_second_drops_nothing(
+    rate_hz: float, learnt: float
+) -> None:
+    factors, dropped, thinned = run(rate_hz, learnt, 20.0)
+    assert dropped == 0
+    assert 0 < thinned < 20 * rate_hz
+    assert rate_hz / learnt < factors[-1] < 1.5 * rate_hz / learnt + 1
+
+
 def test_all_samples_come_again_when_the_stage_is_slower_and_vain_trials_become_rarer() -> None:
     thinner = Thinner(1e-3, 1000)
     assert not thinner.watch(600, 0.0)

@@ -20,7 +20,7 @@ from dehyst.service.answers.guard import Limits
 from dehyst.service.config.learner import read_learner_settings
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.samples import SampleBatch
-from dehyst.service.replay import Replayed, replay, sequence, summary, write_gates
+from dehyst.service.replay import Replayed, replay, summary, write_gates
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
@@ -202,26 +202,6 @@ def test_the_command_says_what_it_lacks(
     assert "--learn" in capsys.readouterr().err
     assert main([*base, "--model", str(model_file), "--dt-s", "0.01"]) == 2
     assert "sample time" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("missing", [3, 60])
-def test_a_short_gap_costs_nothing_soon_after_it(
-    model_file: Path, samples: Recording, replayed: Replayed, missing: int
-) -> None:
-    """60 missing samples used to raise the error for the rest of the recording."""
-    keep = np.ones(len(samples), dtype=np.bool_)
-    keep[4000 : 4000 + missing] = False
-    seq = sequence(samples)
-    cut = Recording(samples.t_s[keep], samples.u_V[keep], samples.y_um[keep], DT_S, source="gap", seq=seq[keep])
-    whole, gapped = replayed, replay(cut, axis_of(model_file))
-    assert gapped.t_s.size == whole.t_s.size
-    assert np.isnan(gapped.adaptive_V[4003 : 4000 + missing]).all()
-    # A gap that is bridged costs nothing. After a longer one the memory is found within a second.
-    after = slice((4100 if missing < 10 else 5000) + missing, None)
-    for with_gap, without in ((gapped.adaptive_V, whole.adaptive_V), (gapped.frozen_V, whole.frozen_V)):
-        rms = [float(np.sqrt(np.nanmean(error[after] ** 2))) for error in (with_gap, without)]
-        assert rms[0] < 1.5 * rms[1]
-    assert np.isfinite(gapped.adaptive_V[:4000]).sum() > 3900
 
 
 def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path) -> None:
