@@ -89,6 +89,13 @@ def test_learning_pays_after_the_change_and_every_sample_is_accounted_for(
     json.dumps(numbers, allow_nan=False)
 
 
+def test_what_was_filled_in_is_not_scored(replayed: Replayed) -> None:
+    unscored = np.flatnonzero(~np.isfinite(replayed.adaptive_V))
+    # Missing samples and readings that were none; the spike was there, and counts.
+    assert set(unscored) == {1700, 1701, 2000, 2001, 2002}
+    assert replayed.repaired
+
+
 def test_nothing_is_foretold_from_what_comes_later(model_file: Path, samples: Recording, replayed: Replayed) -> None:
     """Other voltages from 4 s on change no error before: what is foretold has not seen them."""
     other = replace(samples, u_V=np.where(samples.t_s < 4.0, samples.u_V, samples.u_V[::-1]))
