@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.commands.soak import seconds
 from dehyst.lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
+from dehyst.lab.soak.observed import Intervals
 from dehyst.service.stage_node.faults import decode_fault
 
 # ---- the plan
@@ -38,6 +40,24 @@ def test_unknown_kinds_and_odd_durations_are_refused() -> None:
     for text in ("3s", "abc", "10x", "1e9h", ""):
         with pytest.raises(InputError, match="--duration: got"):
             seconds(text)
+
+
+# ---- which numbers were seen
+
+
+@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 12)), max_size=25), st.sets(st.integers(0, 70)))
+def test_intervals_are_a_set_of_integers(parts: list[tuple[int, int]], others: set[int]) -> None:
+    found, expected = Intervals(), set()
+    for start, n in parts:
+        found.add(start, start + n)
+        expected |= set(range(start, start + n))
+    assert {k for a, b in found.spans for k in range(a, b)} == expected
+    assert len(found) == len(expected)
+    assert all(b < c for (_, b), (c, _) in zip(found.spans, found.spans[1:], strict=False))
+    other = Intervals()
+    other.add_all(np.array(sorted(others, reverse=True), dtype=np.int64))
+    assert {k for a, b in other.spans for k in range(a, b)} == others
+    assert {k for a, b in found.minus(other).spans for k in range(a, b)} == expected - others
 
 
 # ---- faults of a stage

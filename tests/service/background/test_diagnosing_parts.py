@@ -2,15 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dehyst.service.background.settings import WatchConfig
+from dehyst.service.background.watcher import Alarm, Levels
 from dehyst.service.config.settings import parse_config
 from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import SampleBatch
 
 DT_S = 1e-3
+
+
+def batch(first: int, n: int, y_um: float = 1.0) -> SampleBatch:
+    k = np.arange(first, first + n)
+    return SampleBatch(k, k * DT_S, 0.1 * k, np.full(n, y_um))
+
+
+# ---- alarm
+
+NORMAL = Levels(1.0, 0.0, 0.05, True)
+
+
+@pytest.mark.parametrize(
+    ("now", "word"),
+    [
+        (replace(NORMAL, gain=0.985), "gain"),
+        (replace(NORMAL, offset_V=0.3), "offset"),
+        (replace(NORMAL, error_pct=1.0), "error"),
+        (replace(NORMAL, valid=False), "validity"),
+    ],
+)
+def test_an_alarm_needs_to_last(now: Levels, word: str) -> None:
+    alarm = Alarm(WatchConfig(), 10.0)
+    assert alarm.check(0.0, now) == ""
+    alarm.arm(NORMAL)
+    assert alarm.check(1.0, now) == ""
+    assert alarm.check(1.4, NORMAL) == ""
+    assert alarm.check(1.6, now) == ""
+    assert word in alarm.check(2.1, now)
 
 
 # ---- configuration

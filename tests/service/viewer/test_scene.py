@@ -17,8 +17,9 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
 from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
-from dehyst.service.viewer.plane import Plane
-from dehyst.service.viewer.records import Diagnostics, IntArray, SceneConfig, Tracking
+from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
+from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
+from dehyst.service.viewer.rerun_sink import in_order
 from dehyst.service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")
@@ -74,6 +75,12 @@ def drawn(records: Sequence[Any], **config: Any) -> Memory:
     return memory
 
 
+def data(plane: Plane, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions in the box (n, 2) back to data: the inverse of `Plane.points`."""
+    x = positions[:, 0] / WIDTH * (plane.x_limits[1] - plane.x_limits[0]) + plane.x_limits[0]
+    return x, positions[:, 1] / -HEIGHT * (plane.y_limits[1] - plane.y_limits[0]) + plane.y_limits[0]
+
+
 # -- joining -----------------------------------------------------------------------------------------------------
 
 
@@ -122,6 +129,23 @@ def test_errors_in_um_and_percent_of_the_range_are_those_of_the_samples() -> Non
     assert len(memory.curves[style.REFERENCE]) == 3000
 
 
+def test_loops_before_and_after_a_change_are_those_of_their_time() -> None:
+    before = tracking("lssvm_adaptive", 0.0, n=3000)
+    after = tracking("lssvm_adaptive", 5.0, start_s=3.0, n=3000)
+    records = in_order([after, before, Event(3.0, 3000, "gain drops", change=True)])
+    memory = drawn(records, loop_s=1.0)
+    plane = memory.planes[style.LOOP_PLANE]
+    assert 3.0 <= memory.shapes[style.LOOP_BEFORE][0][0] < 3.5
+    # It stands still, and is drawn anew where the axes have grown.
+    u_V, y_um = data(plane, memory.shapes[style.LOOP_BEFORE][-1][1][0])
+    assert y_um == pytest.approx(11.0 * u_V), "nothing from after the change in it"
+    assert np.ptp(y_um) > 55.0
+    t_s, now = memory.shapes[style.LOOP_NOW][-1]
+    u_V, y_um = data(plane, now[0])
+    assert t_s > 5.5
+    assert y_um == pytest.approx(11.0 * u_V - 5.0)
+
+
 def test_diagnostics_become_curves_rates_and_the_window() -> None:
     said = [
         Diagnostics(
@@ -142,6 +166,17 @@ def test_diagnostics_become_curves_rates_and_the_window() -> None:
     assert positions.shape == (3, 2)
     assert np.all(np.diff(positions[:, 0]) > 0)
     assert np.all(np.diff(positions[:, 1]) < 0), "upwards on a screen whose y points down"
+
+
+def test_the_band_lies_two_sigma_around_the_voltage() -> None:
+    samples = tracking("lssvm_adaptive", 0.0, n=1001)
+    memory = drawn(
+        [samples, Diagnostics(0.25, 250, {"std_V": 0.02}), Diagnostics(0.5, 500, {"u_V": 3.0, "std_V": 0.1})]
+    )
+    u_V = float(samples.u_V[250])
+    assert memory.values(style.BAND_HIGH) == pytest.approx([u_V + 0.04, 3.2])
+    assert memory.values(style.BAND_LOW) == pytest.approx([u_V - 0.04, 2.8])
+    assert memory.values(style.SIGMA) == pytest.approx([20.0, 100.0])
 
 
 @pytest.mark.parametrize(
