@@ -13,7 +13,7 @@ from dehyst.lab.rehearsal import EVENT_KINDS, SENSOR, Event, RehearsalConfig, fa
 from dehyst.lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
 from dehyst.lab.rehearsal.outcome import outcome
 from dehyst.lab.rehearsal.plant import FunctionPlant, Plant, run_checked
-from dehyst.lab.rehearsal.reference import RandomReference, ReferenceRequest
+from dehyst.lab.rehearsal.reference import Excursion, RandomReference, ReferenceRequest
 from dehyst.lab.rehearsal.rehearsal import remarks, table
 from dehyst.lab.rehearsal.runs import LoopRecord
 from dehyst.service.answers.guard import Limits
@@ -105,6 +105,17 @@ def test_the_reference_belongs_together_and_keeps_to_its_band(seed: int) -> None
     assert np.abs(np.diff(a)).max() < 0.02 * np.abs(a).max()
     assert np.ptp(y) > 20.0
     assert np.array_equal(RandomReference(wish)(t_s[:100])[0], y[:100])
+
+
+def test_an_excursion_goes_there_and_comes_back_smoothly() -> None:
+    wish = ReferenceRequest(0.0, 10.0, 90.0, 8.0, 1)
+    base = RandomReference(wish)
+    t_s = np.arange(8000) * 1e-3
+    y, v, _ = Excursion(base, 105.0, 3.0, 4.0)(t_s)
+    assert np.allclose(y[(t_s > 3.31) & (t_s < 3.69)], 105.0)
+    outside = (t_s < 3.0) | (t_s > 4.0)
+    assert np.array_equal(y[outside], base(t_s)[0][outside])
+    assert np.abs(np.gradient(y, 1e-3) - v)[2:-2].max() < 1e-2 * np.abs(v).max()
 
 
 # What happens.
@@ -267,6 +278,35 @@ def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
     assert result.adaptive.ends_at_rail
     assert "ENDS AT A RAIL" in remarks(result)
     assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["event"]["kind"] == "gain"
+
+
+def test_trouble_is_timed_by_motion_and_false_where_nothing_happened() -> None:
+    limits, n = Limits(0.0, 10.0, 1e4), 9000
+    said = np.zeros(n)
+    said[3000:3100] = 1
+    said[4250:6000] = 1
+    calm, u_V = np.zeros(n), np.full(n, 5.0)
+    wrong = calm.copy()
+    wrong[4000:6000] = 3.0
+    event = Event("sign", "sign", 4.0, over_s=2.0)
+    result = outcome(
+        event, course(wrong, u_V, said), course(calm + 1.0, u_V), course(calm + 0.8, u_V), 100.0, limits, DT_S, ""
+    )
+    assert [(t.name, t.named_s, t.until_s) for t in result.troubles] == [
+        ("sensor_frozen", pytest.approx(-1.0), pytest.approx(-0.9)),
+        ("sensor_frozen", pytest.approx(0.25), pytest.approx(2.0)),
+    ]
+    # The reference stands still for a moment at each of its ends.
+    assert 0.2 < result.named_s <= 0.25
+    assert result.false_troubles == ("sensor_frozen",)
+    # The better one, off by 0.8 %, is the last estimate: 1.2 % are allowed.
+    assert (result.sensor_ratio, result.sensor_excess) == pytest.approx((3.75, 2.5))
+    assert result.healthy_s == 4.0
+    nothing = outcome(
+        Event("none", "none", 4.0), course(calm, u_V, said), course(calm, u_V), None, 100.0, limits, DT_S, ""
+    )
+    assert nothing.false_troubles == ("sensor_frozen", "sensor_frozen")
+    assert np.isnan(nothing.named_s)
 
 
 def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() -> None:

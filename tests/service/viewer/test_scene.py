@@ -19,7 +19,7 @@ from dehyst.service.viewer import style
 from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
 from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
 from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
-from dehyst.service.viewer.rerun_sink import in_order
+from dehyst.service.viewer.rerun_sink import cut, in_order
 from dehyst.service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")
@@ -127,6 +127,23 @@ def test_errors_in_um_and_percent_of_the_range_are_those_of_the_samples() -> Non
     assert memory.values("mean_error_log10_pct/lssvm_adaptive") == pytest.approx(np.full(60, -1.0))
     # The reference is drawn once, not once a unit.
     assert len(memory.curves[style.REFERENCE]) == 3000
+
+
+def test_the_mean_error_is_that_of_the_last_half_second_however_the_samples_are_cut() -> None:
+    rng = np.random.default_rng(3)
+    whole = tracking("linear", 0.0, n=4000)
+    noisy = Tracking(
+        "linear", whole.seq, whole.t_s, whole.u_V, whole.y_um + rng.standard_normal(4000), whole.reference_um
+    )
+    at_once = drawn([noisy], range_um=60.0)
+    in_pieces = drawn(list(cut(noisy, 0.13)), range_um=60.0)
+    path = "mean_error_pct/linear"
+    assert in_pieces.times(path) == pytest.approx(at_once.times(path))
+    assert in_pieces.values(path) == pytest.approx(at_once.values(path))
+    t_s = at_once.times(path)[40]
+    last = (noisy.t_s > t_s - 0.5 + 1e-9) & (noisy.t_s <= t_s + 1e-9)
+    expected = 100.0 * np.abs(noisy.y_um - noisy.reference_um)[last].mean() / 60.0
+    assert at_once.values(path)[40] == pytest.approx(expected)
 
 
 def test_loops_before_and_after_a_change_are_those_of_their_time() -> None:
