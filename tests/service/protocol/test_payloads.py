@@ -20,7 +20,7 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.container import decode_body, encode_body
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.protocol.keys import check_name
+from dehyst.service.protocol.keys import Keys, check_name
 from dehyst.service.protocol.model import decode_model, encode_model
 from dehyst.service.protocol.query import decode_query, encode_query
 
@@ -189,6 +189,14 @@ def test_a_malformed_header_is_refused(header: Any, words: str) -> None:
 
 
 # --- Names and keys.
+
+
+def test_keys_are_those_of_the_page() -> None:
+    keys = Keys("demo", "x")
+    assert keys.sample == "dehyst/v1/demo/x/sample"
+    assert keys.alive("i1") == "dehyst/v1/demo/x/alive/i1"
+    names = ("sample", "command", "reference", "feedforward", "model", "status", "event", "diagnostics")
+    assert [getattr(keys, name) for name in names] == [f"dehyst/v1/demo/x/{name}" for name in names]
 
 
 @pytest.mark.parametrize("name", ["", "X", "a/b", "*", "**", "a$*", "1a", "a b", "ä", "a" * 65, "a\n", None, 3])
