@@ -23,8 +23,11 @@ from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import (
     BehindError,
     NoReplyError,
+    RefusedError,
     ReplyTimeoutError,
     SessionError,
+    error_from_json,
+    error_to_json,
 )
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE
@@ -157,6 +160,20 @@ def test_commands_leave_within_the_limits_and_say_so_and_references_arrive(clien
         subscriber.undeclare()
 
 
+def test_the_follower_guards_what_leaves_too(client: Client) -> None:
+    follower = client.follow("linear")
+    low = follower.point(12.0)
+    assert low == pytest.approx(1.0)
+    assert follower.point(90.0) == pytest.approx(low + 2.0)
+    for y_um, v in ((200.0, 0.0), (float("nan"), 0.0), (40.0, float("inf"))):
+        with pytest.raises(InputError):
+            follower.point(y_um, v)
+        with pytest.raises(InputError):
+            follower.trajectory([y_um, y_um], [v, v])
+    with pytest.raises(RefusedError, match="sorcery"):
+        client.follow("sorcery")
+
+
 @pytest.mark.parametrize("wrong", ["40", [1.5]], ids=repr)
 def test_an_argument_that_is_no_number_is_named(client: Client, wrong: Any) -> None:
     for field, ask in (
@@ -254,6 +271,15 @@ def test_every_question_is_repeated_while_another_service_takes_over(free_port: 
             again.join()
             assert patient.retries > 0
             assert hasty.retries == 0
+
+
+def test_errors_keep_the_words_of_the_service() -> None:
+    refused = error_from_json(error_to_json(ValueError("no")))
+    assert isinstance(refused, RefusedError)
+    assert (refused.kind, str(refused)) == ("ValueError", "no")
+    assert isinstance(error_from_json(b"Timeout"), ReplyTimeoutError)
+    assert isinstance(error_from_json(b"\xff\xfe"), RefusedError)
+    assert isinstance(error_from_json(b"[1]"), RefusedError)
 
 
 def test_the_command_asks_a_running_service(
