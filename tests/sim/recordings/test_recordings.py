@@ -117,6 +117,18 @@ def test_missing_file_and_empty_folder(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+def test_map_file(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(
+        'sensor_late = 1\n[columns]\nt = "time"\nu = "drive"\ny = "pos"\n[units]\nt = "s"\nu = "V"\n[scale]\ny = 2\n'
+    )
+    mapping = load_map(tmp_path / "map.toml")
+    recording = read(write_csv(tmp_path / "a.csv", "time,drive,pos", T, U, Y), mapping)
+    assert len(recording) == N - 1
+    np.testing.assert_allclose(recording.y_um, 2.0 * Y[1:], atol=1e-6)
+    np.testing.assert_allclose(recording.u_V, U[:-1], atol=1e-6)
+    np.testing.assert_allclose(recording.t_s, T[:-1], atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
