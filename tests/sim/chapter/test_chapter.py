@@ -22,7 +22,7 @@ from dehyst.sim.chapter.control import (
     track_learning,
     training_reference,
 )
-from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, characterise, experiments
+from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments
 from dehyst.sim.chapter.forward_lssvm import fit_two_inputs
 from dehyst.sim.chapter.modelling import identify_forward, refine_bouc_wen
 from dehyst.sim.signals.voltages import training_input
@@ -43,6 +43,13 @@ def rich() -> Experiments:
 @pytest.fixture(scope="module")
 def chapter() -> Experiments:
     return experiments("bouc_wen", quick=True)
+
+
+def test_scores_are_those_of_the_equations() -> None:
+    score = Score.of(np.array([1.0, -3.0]), 50.0)
+    assert score.mae_pct == pytest.approx(4.0)
+    assert score.rmse_pct == pytest.approx(100.0 * np.sqrt(5.0) / 50.0)
+    assert score.max_um == 3.0
 
 
 def test_records_are_those_of_the_chapter(rich: Experiments) -> None:
