@@ -11,7 +11,7 @@ PROCESSES := $(addprefix tests/e2e/,test_soak.py test_scale.py test_demo.py) \
           $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py) \
           $(addprefix tests/service/,viewer/test_sink.py viewer/test_live.py operating security \
           server/test_process.py server/test_gap_live.py storage/test_recorder.py storage/test_folders.py \
-          stage_node fleet adapters commissioning client protocol/test_protocol_page.py \
+          stage_node fleet adapters commissioning client protocol/test_protocol_page.py background/test_priority.py \
           runtime/test_memory.py runtime/test_stopping.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
