@@ -4,8 +4,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
-# Tests of real processes: two at a time, the longest first. Whatever is not listed here only computes. What judges times
-# is marked "alone", and runs so at the end.
+# Tests of real processes, the longest first, three at a time: most of them wait. Whatever is not listed here only
+# computes. What judges times is marked "alone", and runs so at the end.
 PROCESSES := $(addprefix tests/e2e/,test_soak.py test_scale.py test_demo.py) \
           tests/service/failover tests/service/protocol/test_fuzz.py \
           $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py) \
@@ -59,7 +59,7 @@ test: ## lint, types, import contract, and all tests
 	$(BIN)/python -m pytest -m alone $$(grep -rl --include='test_*.py' mark.alone tests)
 
 test-processes: .setup-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not alone and not long" $(PROCESSES)
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not alone and not long" $(PROCESSES)
 
 test-computing: .setup-test
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone and not long" \

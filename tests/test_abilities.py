@@ -55,19 +55,3 @@ def test_no_string_names_an_ability() -> None:
                     names = {part.value for part in ast.walk(node) if isinstance(part, ast.Constant)}
                     found += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in names & known]
     assert not found
-
-
-def test_what_the_service_calls_on_a_learner_is_declared() -> None:
-    """`learner.NAME` in the service, lab and competition: each is a member of the Protocol."""
-    found = []
-    for package in ("service", "lab", "baselines/competition"):
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Attribute) and ast.unparse(node.value) in (
-                    "learner", "self.learner", "self._learner", "axis.learner", "self.favourite",
-                ):  # fmt: skip
-                    found.append((node.attr, f"{path.relative_to(ROOT)}:{node.lineno}"))
-    assert {"freeze", "thaw", "handle", "snapshot"} <= {name for name, _ in found}
-    known = members(OnlineModel).keys() | COMPETITION
-    unknown = [f"{where}: {name}" for name, where in found if name not in known]
-    assert not unknown

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
-from dehyst.adaptive.types import InverseModel
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from dehyst.baselines.common import Domain
 from dehyst.baselines.linear import LinearInverse, LinearParameters
@@ -29,14 +26,6 @@ t = np.arange(400) * 1e-3
 Y = 40 - 30 * np.cos(2 * np.pi * 4 * t) * np.exp(-2 * t)
 V = np.gradient(Y, 1e-3)
 A = np.gradient(V, 1e-3)
-
-
-@every
-def test_is_an_inverse_model_with_its_name(model: LinearInverse | MpiInverse | BoucWenInverse) -> None:
-    assert isinstance(model, InverseModel)
-    assert model.name in ("linear", "mpi", "bouc_wen")
-    memory = model.rest_memory(10.0)
-    assert memory.shape == (model.memory_size,)
 
 
 @every
@@ -132,12 +121,3 @@ def test_nan_points_are_marked_and_forgotten(model: LinearInverse | MpiInverse |
     assert np.isnan(bad.u_V[1])
     assert not bad.inside[1]
     np.testing.assert_allclose(bad.u_V[[0, 2]], good.u_V, atol=1e-12)
-
-
-def test_torch_is_not_imported_by_any_module() -> None:
-    code = (
-        "import importlib, pkgutil, sys\nfrom dehyst import baselines\n"
-        "for m in pkgutil.iter_modules(baselines.__path__): importlib.import_module('dehyst.baselines.' + m.name)\n"
-        "sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

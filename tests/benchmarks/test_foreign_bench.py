@@ -11,76 +11,9 @@ import pytest
 
 from benchmarks import foreign
 from benchmarks.foreign import (
-    LINE,
-    goals,
     main,
     read,
 )
-from dehyst.lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
-from tests.foreign.plants import random_plant
-
-
-def run(name: str, **given: Any) -> dict[str, Any]:
-    """A run in which nothing went wrong, but for what is given."""
-    figures = {"first_second_pct": 0.1, "settled_pct": 0.02, "ends_at_rail": False, "large_s": 0.0, "large_at_s": None}
-    kind = draw(name, 1, 4.0).kind
-    record = {
-        "seed": 1, "class": name, "category": EVENT_KINDS[kind].category, "text": name,
-        "event": {"kind": kind, "size": 0.06},
-        "stage": {"hysteresis": "plays", "dt_s": 1e-3}, "adaptive": figures | {"first_second_pct": 0.1},
-        "frozen": {"settled_pct": 0.5}, "worst_ratio": 0.5, "sensor_excess": None, "sensor_ratio": None, "troubles": [],
-        "false_troubles": [], "healthy_s": 360.0, "named_s": None, "cpu_s": 1.0,
-    }  # fmt: skip
-    record["adaptive"] = figures | {name: given.pop(name) for name in list(given) if name in figures}
-    return record | given
-
-
-FAILED = {"seed": 7, "class": "spikes", "failed": "Traceback\nValueError: no"}
-
-
-def last_cells(text: str) -> list[str]:
-    return [row.split("|")[-2].strip() for row in text.splitlines()[2:]]
-
-
-def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
-    records = [
-        run("none", settled_pct=0.01),
-        run("knock", worst_ratio=0.9, settled_pct=0.03),
-        run("knock", worst_ratio=1.3, large_s=0.2, settled_pct=0.05),
-        run("gain_at_once", first_second_pct=0.2, event={"size": -0.03}, settled_pct=0.02, believed_samples=14),
-        run("gain_at_once", first_second_pct=0.6, event={"size": 0.12}, settled_pct=0.04, believed_samples=18),
-        run("zero_at_once", ends_at_rail=True, settled_pct=9.0, troubles=[{"name": "rail"}], false_troubles=["rail"]),
-        run("sign", sensor_excess=0.5, sensor_ratio=1.2, named_s=0.4),
-        run("stuck_noise", sensor_excess=1.5, sensor_ratio=1.8, named_s=0.1),
-        run("sensor_gain", sensor_excess=0.9, named_s=0.6),
-        run("foreign", sensor_excess=0.9),
-        FAILED,
-    ]
-    told_goals = goals(records)
-    intact, sensors, ratio, knock, step, believed, wrong, settled, false, cost = last_cells(told_goals)
-    assert intact == "2 of 6"
-    assert wrong == "not measured by these runs"
-    assert sensors == "3 of 4; 2 of 4; 1 of 4"
-    assert ratio == "1.50 / 1.80"
-    assert knock == "1.10 / 1.30"
-    # 0.2 % after 3 % and 0.6 % after 12 % are 0.4 and 0.3 % after 6 %.
-    assert step == "0.350 / 0.395 % (0.400 / 0.580 %)"
-    assert believed == "16 / 18"
-    assert settled.startswith("0.035 %")
-    assert false == "1 in 1.00 h of simulated time"
-    assert cost.startswith("not measured")
-    assert "2 runs of 3 to 12 %" in told_goals
-    assert "median over 6 runs" in told_goals
-
-
-def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
-    events = [draw(name, seed, 4.0) for name, seed in LINE]
-    assert all(random_plant(seed).traits.dt_s >= 1e-3 for _, seed in LINE)
-    steps = [event.size for event in events if event.name == "gain_at_once"]
-    assert min(steps) < 0.0 < max(steps)
-    assert random_plant(dict(LINE)["knock"]).traits.modes
-    assert sum(event.category == SENSOR for event in events) == 3
-    assert len({seed for _, seed in LINE}) == len(LINE) == 12
 
 
 @pytest.mark.parametrize(
@@ -99,28 +32,6 @@ def test_what_cannot_be_asked_for_is_refused(
     with pytest.raises(SystemExit):
         main(arguments)
     assert words in capsys.readouterr().err
-
-
-def test_controllers_are_shown_by_median_and_worst(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def stage(seed: int, moving_pct: float | None) -> dict[str, Any]:
-        one = {
-            "way": "I",
-            "age": 5,
-            "moving_pct": moving_pct,
-            "first_second_pct": 0.2,
-            "lines_pct": [4.0, 3.0, 2.0, 1.0],
-        }
-        return {"seed": seed, "ages": [5], "hysteresis": "plays", "cpu_s": 1.0, "controllers": [one]}
-
-    file = tmp_path / "controllers.jsonl"
-    file.write_text(
-        "".join(json.dumps(stage(k, 0.1 * k)) + "\n" for k in (1, 2, 4))
-        + json.dumps({"seed": 5, "ages": [5], "failed": "ValueError: no"})
-    )
-    assert main(["--table", str(file)]) == 1
-    said = capsys.readouterr().out
-    assert "3 stages" in said
-    assert "| an integrator alone | 5 | 0.200 / 0.400 | 0.200 / 0.200 | 4.000 / 4.000 |" in said
 
 
 def healthy_run(seed: int, **given: Any) -> dict[str, Any]:

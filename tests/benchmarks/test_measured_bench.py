@@ -11,10 +11,8 @@ import pytest
 from benchmarks import measured
 from benchmarks.measured import (
     SCORES,
-    Cut,
     Record,
     Source,
-    columns_of,
     data_folder,
     least_squares,
     main,
@@ -42,27 +40,6 @@ def test_the_recursion_is_weighted_least_squares_of_the_samples_before_the_age()
         information = (Z[rows].T * weight) @ Z[rows] + forget**seen * prior
         expected = Z[n + k] @ np.linalg.solve(information, (Z[rows].T * weight) @ u[rows])
         assert got[k] == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-def test_late_readings_are_put_beside_their_voltages(tmp_path: Path) -> None:
-    t_s, u_V = np.arange(100) * 0.01, np.arange(100.0)
-    rows = np.column_stack([t_s, u_V, np.r_[np.zeros(2), u_V[:-2]]])
-    np.savetxt(tmp_path / "late.csv", rows, delimiter=",", header="t_s,u_V,y_um", comments="")
-    cut = Cut.of(Record("late", Source("late.csv", um=3.0), (0.1, 0.5), (0.5, 0.9)), tmp_path, late=2)
-    assert (cut.split, cut.u_V.size, cut.left, cut.jump) == (40, 80, 8, False)
-    assert np.array_equal(cut.y_um, 3.0 * cut.u_V)
-
-
-def test_columns_of_two_runs_do_not_see_the_jump_between_them() -> None:
-    y_um = np.r_[np.sin(np.arange(500) * 0.02), 5.0 + np.sin(np.arange(300) * 0.02)]
-    cut = Cut(0.001, np.zeros(800), y_um, 500, jump=True)
-    Z, at = columns_of(cut)
-    assert at.tolist() == list(range(800))
-    assert Z[500:780, -2:] == pytest.approx(Z[:280, -2:])  # velocity and acceleration: the same motion elsewhere
-    fast, every = columns_of(Cut(0.0004, np.zeros(800), y_um, 500, jump=True))
-    assert every[:3].tolist() == [0, 3, 6]
-    assert 500 in every
-    assert fast.shape == (every.size, Z.shape[1])
 
 
 def test_a_record_that_is_missing_is_skipped_with_the_reason(

@@ -1,14 +1,15 @@
 """A router, two service hosts and a lab host with stages and clients; one service host is lost in the middle.
 
-``python -m tests.e2e.scale_drill FOLDER [--processes]`` does it and prints one line of JSON. With namespaces it is to
-be run inside ``unshare -rn``, where it is the root of a network of its own. Everything speaks TLS with passwords and
-access control, made by the project's own command, because that is what ``dehyst serve`` asks for beyond loopback.
+Hosts are groups of processes on loopback. Everything speaks TLS with passwords and access control, made by the
+project's own command, because that is what ``dehyst serve`` asks for beyond loopback.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import os
+import signal
+import subprocess
 import sys
 import threading
 import time
@@ -18,13 +19,38 @@ from typing import Any
 from dehyst.service.security.access import Plan, create
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.e2e.scale_client import AXES, BEFORE_S, RATE_HZ, STAGES
-from tests.e2e.scale_hosts import Host, make_hub
 from tests.service.conftest import make_models, unused_port
 
 USERS = {
     "relay": "router", "one": "service", "two": "service", "left": "stage", "right": "stage",
     "plot": "client", "loop": "controller", "alice": "operator",
 }  # fmt: skip
+
+
+class Host:
+    """The processes of one machine."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.running: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        """``python`` with ``arguments`` on this host."""
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        process = subprocess.Popen([sys.executable, *arguments], text=True, stdout=subprocess.PIPE, env=environment)
+        self.running.append(process)
+        return process
+
+    def lose(self) -> None:
+        """It says nothing from one instant to the next, and its connections stay open, as if its cable were pulled."""
+        for process in self.running:
+            process.send_signal(signal.SIGSTOP)
+
+    def stop(self) -> None:
+        """End what runs here."""
+        for process in self.running:
+            process.kill()
+            process.communicate(timeout=20)
 
 
 class Stall(threading.Thread):
@@ -50,16 +76,12 @@ class Stall(threading.Thread):
         return self.worst_s
 
 
-def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
+def drill(folder: Path) -> dict[str, Any]:
     """Do it; returns what was seen."""
-    make_hub(namespaces)
-    relay, one, two, lab = (Host(name, 2 + i, namespaces) for i, name in enumerate(("relay", "one", "two", "lab")))
-    hosts = [relay, one, two, lab]
+    relay, one, two, lab = hosts = [Host(name) for name in ("relay", "one", "two", "lab")]
     try:
-        for host in hosts:
-            host.up()
-        router = f"tls/{relay.address}:{unused_port()}"
-        create(folder, Plan(USERS, (relay.address,), {"left": "left", "right": "right"}))
+        router = f"tls/127.0.0.1:{unused_port()}"
+        create(folder, Plan(USERS, ("127.0.0.1",), {"left": "left", "right": "right"}))
         cli = ("-m", "dehyst.lab.cli")
         route = relay.start(*cli, "router", "--listen", router, "--zenoh-config", str(folder / "relay.json5"), "--json")
         _line(route)
@@ -75,7 +97,6 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
                 config = _config(folder / f"{host.name}-{stage}", folder / f"{host.name}.json5", stage, router)
                 services[host.name, stage] = host.start(*cli, "serve", "--config", str(config), "--json", *options)
             roles |= {key: _line(process) for key, process in services.items()}
-        _say("services started")
         for stage in STAGES:
             lab.start(
                 *cli, "stage", "--free-run", "--name", stage, "--axis", "x", "--twins", "y", "--rate", str(RATE_HZ),
@@ -83,17 +104,14 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
             )  # fmt: skip
         client = lab.start("-m", "tests.e2e.scale_client", str(folder), router)
         _line(client)
-        _say("the client is answered by every axis")
         told = {f"{h}/{s}": ready for (h, s), ready in roles.items()}
         seen: dict[str, Any] = {
-            "namespaces": namespaces,
             "roles": {key: ready["role"] for key, ready in told.items()},
             "epochs": {key: ready["epoch"] for key, ready in told.items()},
             "stalled_s": stall.end(),
         }
         time.sleep(BEFORE_S)
         lost_at = time.monotonic()
-        _say("host one is lost")
         one.lose()
         assert client.stdout is not None
         seen["client"] = json.loads(client.stdout.read().splitlines()[-1])
@@ -124,20 +142,3 @@ def _line(process: Any) -> dict[str, Any]:
         raise RuntimeError(f"{process.args} ended with {process.wait()}")
     data: dict[str, Any] = json.loads(line)
     return data
-
-
-def _say(what: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {what}", file=sys.stderr, flush=True)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--processes", action="store_true", help="plain processes instead of namespaces")
-    args = parser.parse_args()
-    print(json.dumps(drill(args.folder, not args.processes)), flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
-import subprocess
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,7 +14,7 @@ import pytest
 from dehyst.service.client.client import Client
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.protocol.query import Point
-from tests.e2e.scale_hosts import ENTER, namespaces_missing
+from tests.e2e.scale_drill import drill
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually
 
@@ -30,24 +27,14 @@ _STALL_S = 0.7
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the openssl command is not installed")
 @pytest.mark.timeout(300)
-def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path, record_property: Any) -> None:
-    missing = namespaces_missing()
-    record_property("hosts", f"processes: {missing}" if missing else "network namespaces")
-    if missing:
-        print(f"no network namespaces here ({missing}): plain processes on loopback instead")
-    enter, options = ((), ("--processes",)) if missing else (ENTER, ())
-    done = subprocess.run(
-        [*enter, sys.executable, "-m", "tests.e2e.scale_drill", str(tmp_path / "access"), *options],
-        capture_output=True, text=True, timeout=280, check=False, cwd=Path(__file__).parents[2],
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    seen = json.loads(done.stdout.splitlines()[-1])
+def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path) -> None:
+    seen = drill(tmp_path / "access")
     planned = {"one/left": "primary", "two/right": "primary", "two/left": "standby", "one/right": "standby"}
     if seen["roles"] != planned and seen["stalled_s"] > _STALL_S:
         pytest.skip(
             f"the machine stood still for {seen['stalled_s']:.1f} s: a standby rightly took over before the loss"
         )
-    assert seen["roles"] == planned, (seen["epochs"], seen["stalled_s"], done.stderr[-3000:])
+    assert seen["roles"] == planned, (seen["epochs"], seen["stalled_s"])
     client = seen["client"]
     before, after = (
         {f"{status['stage']}/{status['axis']}": status for status in client[when]} for when in ("before", "after")

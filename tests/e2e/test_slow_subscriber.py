@@ -52,13 +52,13 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             sender.start()
             try:
                 children.append(started("dehyst.lab.soak.disturbers", "slow", endpoint))
-                time.sleep(6.0)
+                time.sleep(4.0)
                 # Others come and go meanwhile, which is when everybody would have to wait.
                 for _ in range(4):
                     with open_client(endpoint, 10.0) as third:
                         third.declare_subscriber("somewhere/else", lambda _: None)
                 children[1].terminate()
-                time.sleep(2.0)
+                time.sleep(1.0)
             finally:
                 stop.set()
                 sender.join()
@@ -68,5 +68,5 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             child.kill()
             child.communicate(timeout=20)
     gaps = [after - before for before, after in itertools.pairwise(came)]
-    assert len(came) > 0.9 * RATE_HZ * 6.0
+    assert len(came) > 0.9 * RATE_HZ * 4.0
     assert max(gaps) < LEASE_S

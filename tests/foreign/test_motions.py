@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dehyst.lab.rehearsal.reference import BEGIN_S, REST_S, Motion, ReferenceRequest, Sawtooth
+from dehyst.lab.rehearsal.reference import BEGIN_S, REST_S, Motion, ReferenceRequest
 from dehyst.lab.rehearsal.runs import times
 from tests.foreign.motions import (
     MOTIONS,
     NIGHT_FROM_S,
-    Levels,
     MotionMaker,
-    Rounded,
-    Spiral,
     motion,
 )
 
@@ -75,38 +72,6 @@ def test_the_frequency_is_the_one_asked_for(name: str, frequency_Hz: float) -> N
     assert turns.size == pytest.approx(8.0 * frequency_Hz, abs=1)
 
 
-def test_a_triangle_has_two_velocities_and_no_acceleration() -> None:
-    y, v, a = Sawtooth(10.0)(np.array([0.0, 0.025, 0.05, 0.075]))
-    assert y.tolist() == pytest.approx([0.0, 0.5, 1.0, 0.5])
-    assert v.tolist() == [20.0, 20.0, -20.0, -20.0]
-    assert not a.any()
-    assert Sawtooth(10.0, back=0.1)(np.array([0.09, 0.095])).y_um.tolist() == pytest.approx([1.0, 0.5])
-
-
-def test_the_turns_of_a_rounded_triangle_are_parabolas_within_the_same_band() -> None:
-    t_s = times(10_000, 1e-5)
-    y, v, a = Rounded(10.0, 0.2)(t_s)
-    assert (y.min(), y.max()) == pytest.approx((0.0, 1.0))
-    assert v[0] == pytest.approx(0.0)
-    assert np.count_nonzero(a) / a.size == pytest.approx(0.4, abs=0.01)
-    assert v.max() == pytest.approx(10.0 / 0.4)
-
-
-def test_levels_are_left_at_their_times_and_reached_after_the_way() -> None:
-    shape = Levels(np.array([1.0, 2.0]), np.array([0.2, 0.8, 0.5]), 0.1)
-    assert shape(np.array([0.0, 1.0, 1.05, 1.1, 1.9, 2.05, 9.0])).y_um.tolist() == pytest.approx(
-        [0.2, 0.2, 0.5, 0.8, 0.8, 0.65, 0.5]
-    )
-
-
-def test_a_spiral_grows_and_shrinks() -> None:
-    t_s = times(40_000, 1e-4)
-    y = np.abs(Spiral(20.0, 2.0)(t_s).y_um - 0.5)
-    assert y[:500].max() < 0.02
-    assert y[19_000:21_000].max() > 0.48
-    assert y[-500:].max() < 0.02
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_rest_lasts_as_long_as_it_is_to_and_the_motion_goes_on(seed: int) -> None:
     t_s = times(120_000, DT_S)
@@ -121,18 +86,3 @@ def test_a_rest_lasts_as_long_as_it_is_to_and_the_motion_goes_on(seed: int) -> N
         assert not a[still].any()
         assert y[-1] != y[still][0]
         assert np.abs(v[t_s >= begin_s][:2000]).max() > 0.0
-
-
-def test_seeds_draw_motions_and_a_name_may_fix_the_frequency() -> None:
-    t_s = times(50_000, 1e-3)[:5000]
-    assert np.array_equal(made("noise", 1, t_s).y_um, made("noise", 1, t_s).y_um)
-    assert not np.array_equal(made("noise", 1, t_s).y_um, made("noise", 2, t_s).y_um)
-    drawn = [MOTIONS["raster"].drawn_Hz(seed) for seed in range(200)]
-    assert 1.0 <= min(drawn) < 1.5
-    assert 40.0 < max(drawn) <= 50.0
-    assert motion("raster:10").drawn_Hz(7) == 10.0
-    for wrong in ("raster:0", "raster:nan", "raster:x"):
-        with pytest.raises(ValueError, match=r"raster|convert"):
-            motion(wrong)
-    with pytest.raises(KeyError):
-        motion("circle")

@@ -14,7 +14,7 @@ before the sensor had a name, the rest is learnt in the seconds after that. 3 of
 two seconds, all with several faults of the sensor or messages shortly after one another; after three none had.
 Three moves of the zero within a second, 12 % of the range in all, leave 0.06 more after three seconds (found later).
 
-``DEHYST_EXAMPLES`` : sequences that are tried, 12 unless told; where it is given, one that fails is made shorter.
+``DEHYST_EXAMPLES`` : sequences that are tried, 8 unless told; where it is given, one that fails is made shorter.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ MOST_GAIN, MOST_ZERO = 1.2, 0.1
 #: The largest jump of the count leaves room for numbers after it.
 JUMPS = {"1000": 1000, "100000": 100_000, "2**62": 2**62 - 2**40}
 #: Sequences that are tried.
-EXAMPLES = int(os.environ.get("DEHYST_EXAMPLES", "12"))
+EXAMPLES = int(os.environ.get("DEHYST_EXAMPLES", "8"))
 
 
 class Bench:

@@ -58,19 +58,6 @@ def test_a_seed_makes_the_same_stage_whatever_the_blocks(seed: int) -> None:
     assert random_plant(seed).traits == traits
 
 
-def test_the_family_has_what_it_is_to_have() -> None:
-    traits = [random_plant(seed).traits for seed in range(300)]
-    assert {t.hysteresis for t in traits} == set(HYSTERESIS)
-    assert {len(t.modes) for t in traits} == {0, 1, 2}
-    assert {round(1.0 / t.dt_s) for t in traits} == {500, 1000, 2000, 5000, 10000}
-    assert {len(t.creep) for t in traits} == {0, 1, 2, 3}
-    assert min(t.range_um for t in traits) < 0.0 < max(t.range_um for t in traits)
-    assert all(1.0 <= abs(t.range_um) <= 500.0 and 0.08 <= t.width <= 0.2 for t in traits)
-    assert all(100.0 <= f <= 1000.0 and 0.005 <= zeta <= 0.3 for t in traits for f, zeta, _ in t.modes)
-    assert all(t.noise_um <= 5e-4 * abs(t.range_um) for t in traits)
-    assert all(t.u_min_V <= t.excite_V[0] < t.excite_V[1] <= t.u_max_V for t in traits)
-
-
 @pytest.mark.parametrize("kind", [PLAYS, PREISACH, BOUC_WEN, DUHEM])
 def test_the_largest_loop_is_as_wide_as_told_and_the_voltage_leads(kind: int) -> None:
     factory = of_kind(kind)
@@ -100,27 +87,6 @@ def test_a_stage_moves_with_the_voltage_also_just_after_a_turn(seed: int) -> Non
     back_um, _ = plant.run(np.linspace(turn_V, turn_V - 0.02 * (high_V - low_V), 2000))
     moved = (back_um[-1] - rest_um[-1]) / traits.range_um
     assert -0.03 < moved < -0.001
-
-
-@pytest.mark.parametrize("kind", [PLAYS, PREISACH])
-def test_a_minor_loop_closes_and_is_wiped_out(kind: int) -> None:
-    plant = of_kind(kind)()
-    slow = np.concatenate(
-        [triangle(0.0, 100.0, 20_000), np.linspace(0.0, 60.0, 20_000), np.linspace(60.0, 30.0, 20_000)]
-    )
-    plant.run(slow)
-    there, back = np.linspace(30.0, 60.0, 20_000), np.linspace(60.0, 30.0, 20_000)
-    first = plant.run(np.concatenate([there, back]))[0]
-    second = plant.run(np.concatenate([there, back]))[0]
-    # From sample 1 on: the first reading is of the voltage before.
-    assert np.abs(first[1:] - second[1:]).max() < 1e-3 * np.ptp(first)
-
-
-def test_a_thousand_turns_do_not_fill_the_preisach_stack() -> None:
-    plant = of_kind(PREISACH)()
-    amplitude = np.linspace(50.0, 0.5, 6000)
-    true_um, _ = plant.run(50.0 + amplitude * np.where(np.arange(6000) % 2, 1.0, -1.0))
-    assert np.isfinite(true_um).all()
 
 
 def test_a_step_rings_at_the_frequency_and_damping_of_the_mode() -> None:
@@ -154,34 +120,3 @@ def test_changes_are_taken_and_scale_as_told() -> None:
     assert true_um[-1] - before_um == pytest.approx(-2.5, rel=1e-9)
     assert not factory().change(Change("knock", 1.0))  # nothing there that rings
     assert not factory().change(Change("unheard of", 1.0))
-
-
-def test_a_knock_rings_by_its_size_and_leaves_nothing() -> None:
-    factory = ringing()
-    struck, plain = factory(), factory()
-    u_V = np.full(1000, 4.0)
-    for plant in (struck, plain):
-        plant.run(u_V)
-    assert struck.change(Change("knock", 2.0))
-    rest = np.full(20_000, 4.0)
-    swing = struck.run(rest)[0] - plain.run(rest)[0]
-    assert np.abs(swing[:10]).max() == pytest.approx(2.0, rel=0.1)
-    assert np.abs(swing[-100:]).max() < 1e-3
-
-
-def test_a_payload_lowers_the_frequency_and_a_lag_slows() -> None:
-    heavy = ringing()()
-    heavy.run(np.full(2000, 4.0))
-    assert heavy.change(Change("payload", 1.0))
-    true_um, _ = heavy.run(np.full(4096, 4.5))
-    swing = true_um[1:] - true_um[-500:].mean()
-    spectrum = np.abs(np.fft.rfft(swing * np.hanning(swing.size)))
-    assert np.fft.rfftfreq(swing.size, 5e-4)[spectrum.argmax()] == pytest.approx(200.0 / np.sqrt(2.0), abs=1.0)
-    factory = with_traits(ringing(), modes=())
-    slow, plain = factory(), factory()
-    for plant in (slow, plain):
-        plant.run(np.full(2000, 4.0))
-    assert slow.change(Change("lag", 5e-3))
-    for plant, share in ((slow, 1.0 - np.exp(-1.0)), (plain, 1.0)):
-        true_um, _ = plant.run(np.full(2000, 4.5))
-        assert (true_um[10] - true_um[0]) / (true_um[-1] - true_um[0]) == pytest.approx(share, abs=0.1)

@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dehyst.lab.loop import Asker, Twins, samples, stepped, turns
+from dehyst.lab.loop import Asker, stepped, turns
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import Bundle, BundleMeta
-from dehyst.sim.stage.presets import preset
-from dehyst.sim.stage.stage import Stage
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0)
@@ -80,17 +78,3 @@ def test_each_answer_continues_the_one_before(tracked: bool) -> None:
     assert ends[2] < ends[0] < ends[1], "hysteresis: the way back needs less voltage"
     alone = Asker(axis, tracked=tracked, u_before_V=0.0)(0, (level, still, still))
     assert float(alone.u_V[-1]) == ends[0]
-
-
-def test_twins_run_alike_by_their_own_voltages() -> None:
-    twins = Twins(Stage(preset("rich")), ("one", "other"), 100)
-    for name in twins.u_V:
-        twins.u_V[name][:] = 3.0
-    twins.u_V["other"][50:] = 4.0
-    for first in range(0, 100, BLOCK):
-        twins.run(slice(first, first + BLOCK))
-    one, other = twins.y_um.values()
-    np.testing.assert_array_equal(one[:50], other[:50])
-    assert other[-1] > one[-1] + 1.0
-    batch = samples(60, 1e-3, twins.u_V["one"][60:80], one[60:80])
-    assert (batch.seq[0], batch.t_s[0], len(batch)) == (60, 0.06, 20)

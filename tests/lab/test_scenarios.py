@@ -16,13 +16,11 @@ from dehyst.lab.scenarios import (
     FROZEN,
     ScenarioRecord,
     judge,
-    noise_floor_um,
     run_scenario,
     windows,
 )
 from dehyst.sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
 from dehyst.sim.signals.references import DemoReference, Sequenced, Tones, strokes
-from dehyst.sim.stage.presets import preset
 
 GATES = ("learnt", "glitch")
 
@@ -51,14 +49,6 @@ def test_a_tenth_and_three_noise_floors_are_allowed(
     verdict = judge(course(adaptive_um, frozen_um, floor_um))
     assert verdict.held is held
     assert FLOORS == 3.0
-
-
-def test_the_noise_floor_is_the_sensors() -> None:
-    config = preset("rich", seed=1)
-    floor = noise_floor_um(config)
-    assert 0.004 < floor < 0.007
-    louder = replace(config, effects=config.effects.replace({"sensor_noise.rms_um": 3.0 * 0.0065}))
-    assert noise_floor_um(louder) == pytest.approx(3.0 * floor, rel=0.05)
 
 
 def short_gain_step() -> Scenario:

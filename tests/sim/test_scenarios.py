@@ -8,23 +8,11 @@ import pytest
 from dehyst.adaptive.errors import InputError
 from dehyst.sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, scenario
 from dehyst.sim.signals.references import Sequenced, Tones
-from dehyst.sim.stage.stage import Stage
 
 
 def shortened(kind: str, seed: int) -> Scenario:
     """The scenario of a kind; the dwell with a rest that a test can afford."""
     return dwell(seed, np.random.default_rng(seed), 4.0) if kind == "dwell" else scenario(kind, seed)
-
-
-@pytest.mark.parametrize("kind", SCENARIO_KINDS)
-def test_a_seed_gives_the_same_scenario_again_and_another_seed_another(kind: str) -> None:
-    first, again, other = shortened(kind, 1), shortened(kind, 1), shortened(kind, 2)
-    assert first.changes == again.changes
-    assert first.glitches == again.glitches
-    assert first.text == again.text
-    assert np.array_equal(first.reference().y_um, again.reference().y_um)
-    assert first.name == f"{kind}/1"
-    assert not np.array_equal(first.reference().y_um, other.reference().y_um[: first.reference().y_um.size])
 
 
 @pytest.mark.parametrize("kind", SCENARIO_KINDS)
@@ -37,21 +25,6 @@ def test_the_reference_stays_in_its_range_and_its_derivatives_are_its_own(kind: 
     for value, slope in ((r.y_um, r.v_um_per_s), (r.v_um_per_s, r.a_um_per_s2)):
         difference = (value[2:] - value[:-2]) / (2.0 * dt)
         assert np.max(np.abs(difference - slope[1:-1])) < 0.015 * np.max(np.abs(slope))
-
-
-@pytest.mark.parametrize("kind", [kind for kind in SCENARIO_KINDS if kind not in ("glitches", "dwell", "band")])
-def test_the_stage_changes_then_and_not_before(kind: str) -> None:
-    s = scenario(kind, 2)
-    begin = round(s.change_s / s.stage.dt_s)
-    t = np.arange(begin + 8000) * s.stage.dt_s
-    u_V = 4.0 - 3.0 * np.cos(2.0 * np.pi * 1.7 * t)
-    readings = []
-    for config in (s.stage, s.changing_stage()):
-        stage = Stage(config)
-        readings.append(stage.run(stage.initial_state(), u_V)[0])
-    assert np.array_equal(readings[0][:begin], readings[1][:begin])
-    difference = np.abs(readings[1] - readings[0])
-    assert np.max(difference[begin:]) > 5e-3
 
 
 def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:

@@ -17,7 +17,6 @@ from dehyst.baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
 from dehyst.baselines.common import Domain
 from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.baselines.competition.competition import (
-    BETTER,
     ChampionChoice,
     Competition,
 )
@@ -116,15 +115,6 @@ def test_the_better_one_is_served_after_a_while_and_the_favourite_comes_back() -
     assert model.standing()["changes"] == 2 == model.counters()["champion_changes"]
 
 
-def test_errors_are_those_of_the_answers_for_the_motion() -> None:
-    model, _, _ = contest(1.1 * GAIN, GAIN)
-    feed(model, 6000, 0)
-    standing = model.standing()["contestants"]
-    u, _ = motion(6000)
-    assert standing["one"]["rms_V"] == pytest.approx(np.sqrt(np.mean((u / 1.1 - u) ** 2)), rel=0.2)
-    assert standing["two"]["rms_V"] < 2e-3
-
-
 def test_a_baseline_states_what_its_answers_were_wrong_by() -> None:
     """Not less than its own fit says, and only as champion; a state goes on with it."""
     model, one, _ = contest(1.1 * GAIN, 1.3 * GAIN)
@@ -171,14 +161,6 @@ def test_a_challenger_needs_margin_and_floor_and_the_favourite_neither() -> None
     assert reign((0.016, 0.006), margin=1.25, floor=0.001).champion == 1
     assert reign((0.0999, 0.1, 0.3), champion=1, margin=1.25, floor=0.001).champion == 0
     assert reign((0.2, 0.11, 0.1), champion=1).champion == 1
-
-
-def test_the_favourite_returns_with_the_first_judgement_that_finds_it_no_worse() -> None:
-    """Served by another, callers get the other's errors: every second of patience costs them."""
-    made = ChampionChoice(CompetitionConfig(patience_s=0.5), SPAN_V, champion=1)
-    assert made.choose((0.11, 0.1), 0.02) == ""
-    assert made.choose((0.0999, 0.1), 0.02) == BETTER
-    assert (made.champion, made.changes) == (0, 1)
 
 
 def test_callers_go_over_without_a_jump_each_in_its_own_stream() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.lab.rehearsal import CLASSES, EVENT_KINDS, SENSOR, Event, RehearsalConfig, draw, factory_of, rehearse
-from dehyst.lab.rehearsal.disturbance import INTACT, MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from dehyst.lab.rehearsal import EVENT_KINDS, SENSOR, Event, RehearsalConfig, factory_of, rehearse
+from dehyst.lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
 from dehyst.lab.rehearsal.outcome import outcome
 from dehyst.lab.rehearsal.plant import FunctionPlant, Plant, run_checked
 from dehyst.lab.rehearsal.reference import Excursion, RandomReference, ReferenceRequest
@@ -119,23 +119,6 @@ def test_an_excursion_goes_there_and_comes_back_smoothly() -> None:
 
 
 # What happens.
-
-
-def test_every_class_is_drawn_by_its_seed_and_says_what_it_is() -> None:
-    for name in CLASSES:
-        one = draw(name, 5, 3.0)
-        assert one == draw(name, 5, 3.0)
-        assert one.text
-        assert one.category == EVENT_KINDS[one.kind].category
-        assert json.loads(json.dumps(one.size)) == one.size
-    assert {EVENT_KINDS[kind].category for kind in ("stuck", "stuck_noise", "sensor_gain", "sign", "foreign")} == {
-        SENSOR
-    }
-    assert {kind.category for kind in EVENT_KINDS.values()} == {INTACT, SENSOR}
-    with pytest.raises(InputError, match="some of none"):
-        draw("thunder", 0, 3.0)
-    with pytest.raises(InputError, match="2 s or later"):
-        draw("knock", 0, 1.0)
 
 
 def stood(event: Event, u_V: np.ndarray, block: int = 7) -> np.ndarray:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dehyst.lab.soak.fault_plan import FAULT_KINDS, make_plan
 from dehyst.lab.soak.judge import MEMORY_MB, TRACKING_PCT
 from dehyst.lab.soak.observed import FaultRecord, Observations
-from dehyst.lab.soak.report import draw, report, verdict_line
+from dehyst.lab.soak.report import verdict_line
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 
@@ -73,25 +71,6 @@ def test_every_invariant_is_broken_by_what_it_is_there_for(what: str) -> None:
     assert found["verdict"] == "broken"
 
 
-def test_samples_are_accounted_for() -> None:
-    def thinned(k: int, status: dict[str, Any]) -> None:
-        samples = status["samples"]
-        if k >= 30:
-            samples |= {"received": samples["received"] + 2000, "thinned": 5000, "dropped": 2000}
-            samples["gates"]["learnt"] -= 5000
-            status["seq"] -= 5000 if k < 33 else 0
-        if k >= 33:
-            # Those that waited before them have been handled: only now their numbers have been passed.
-            samples["left_out"] = 7000
-            status["seq"] += 2000
-
-    def lost(k: int, status: dict[str, Any]) -> None:
-        status["samples"]["gates"]["learnt"] -= 100 if k == 30 else 0
-
-    assert broken(verdict(healthy(change=thinned))) == set()
-    assert broken(verdict(healthy(change=lost))) == {"samples_accounted"}
-
-
 @pytest.mark.parametrize(("grows_mb", "held"), [(0.5 * MEMORY_MB, True), (1.5 * MEMORY_MB, False)])
 def test_memory_in_use_is_compared_with_that_after_the_warm_up(grows_mb: float, held: bool) -> None:
     def grows(k: int, status: dict[str, Any]) -> None:
@@ -102,28 +81,3 @@ def test_memory_in_use_is_compared_with_that_after_the_warm_up(grows_mb: float, 
     found = verdict(healthy(1000, grows))
     assert found["invariants"]["memory"]["held"] is held
     assert verdict(healthy(700, grows))["not_judged"] == ["memory"], "less than ten minutes after the warm-up"
-
-
-def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
-    observed = healthy()
-    for second in observed.seconds[36:]:
-        second.error_sum_um = 1000.0
-    observed.faults.append(FaultRecord("gap", 36.0, 38.5))
-    assert broken(verdict(observed)) == set()
-    for second in observed.seconds[30:]:
-        second.error_sum_um = 1000.0
-    observed.faults[-1] = FaultRecord("gap", 31.0, 32.0)
-    assert broken(verdict(observed)) == {"recovers_by_itself", "faults_told", "tracking"}
-
-
-def test_the_files_of_a_run_say_what_was_found(tmp_path: Path) -> None:
-    observed = healthy()
-    observed.faults[0].breaches.append("it went wrong")
-    observed.notes.append("a note")
-    found = verdict(observed)
-    text = report(found, observed, make_plan(40.0, 1, ("gap",)), interrupted=True)
-    assert text.startswith("# Soak: broken; not judged: memory (too short a run)\n")
-    for part in ("Interrupted", "- a note", "- **gap: it went wrong**", f"| gap | {FAULT_KINDS['gap'].what} | 1 |"):
-        assert part in text
-    draw(tmp_path / "soak.png", observed)
-    assert (tmp_path / "soak.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

@@ -88,18 +88,6 @@ def order(model_file: Path, from_seq: int) -> dict[str, Any]:
     return {"model": str(model_file), "name": "lssvm_adaptive", "from_seq": from_seq, "report": ""}
 
 
-def test_a_job_names_the_change_in_a_process_of_its_own(model_file: Path) -> None:
-    samples = recorded(model_file, 14.0, 7.0, gain_drift__gain=-0.019)
-    told: list[dict[str, Any]] = []
-    job = diagnosis_job(order(model_file, 7000), samples[:, :6500], samples[:, 2000:], 60.0, told.append)
-    job.start()
-    eventually(lambda: not job.running, 60.0)
-    assert told[0]["verdict"] == "changed"
-    assert told[0]["effects"][0]["name"] == "gain_drift"
-    assert told[0]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.003)
-    assert "gain drift, -1." in told[0]["text"] or "gain drift, -2." in told[0]["text"]
-
-
 @pytest.mark.parametrize("clock_s", [0.0, -3600.0])
 def test_what_is_recent_is_looked_at_though_a_longer_part_lies_before_a_gap(model_file: Path, clock_s: float) -> None:
     samples = recorded(model_file, 18.0, 9.0, gain_drift__gain=-0.03)

@@ -22,9 +22,6 @@ def batch(first: int, n: int, y_um: float = 1.0) -> SampleBatch:
     return SampleBatch(k, k * DT_S, 0.1 * k, np.full(n, y_um))
 
 
-# ---- buffer
-
-
 # ---- alarm
 
 NORMAL = Levels(1.0, 0.0, 0.05, True)

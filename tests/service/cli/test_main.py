@@ -6,7 +6,6 @@ import argparse
 import importlib
 import io
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from dehyst.lab.cli import COMMANDS, main
-from dehyst.service.cli.main import GROUPS, build_parser
+from dehyst.service.cli.main import build_parser
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCUMENTED = """
@@ -39,17 +38,6 @@ def test_every_documented_command_is_there_with_help_and_a_log_level(
         text = parser.format_help()
         assert f"dehyst {name}" in text
         assert "--log-level" in text
-
-
-def test_help_lists_all_commands_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--help"])
-    text = capsys.readouterr().out
-    assert ended.value.code == 0
-    places = [text.index(f"\n{group}:\n") for group in GROUPS]
-    assert places == sorted(places)
-    for name in COMMANDS:
-        assert re.search(rf"^  {name} ", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dehyst.service.client.client import Client
-from dehyst.service.protocol.errors import BusyError, RefusedError, error_from_json
+from dehyst.service.protocol.errors import BusyError, RefusedError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import encode_query
 from dehyst.service.runtime.session import open_client, open_service
@@ -105,12 +105,3 @@ def test_a_client_waits_as_long_as_it_is_told(free_port: int) -> None:
     assert refused.value.retry_after_s == 0.2
     assert len(came) == 3
     assert min(np.diff(came)) >= 0.2
-
-
-def test_busy_without_a_time_is_an_ordinary_refusal() -> None:
-    for wrong in (
-        '{"error": "busy"}',
-        '{"error": "busy", "retry_after_s": -1}',
-        '{"error": "busy", "retry_after_s": 1e999}',
-    ):
-        assert type(error_from_json(wrong.encode())) is RefusedError

@@ -87,18 +87,6 @@ def test_it_is_the_model_along_any_motion(name: str, wanted: list[tuple[float, i
     assert LIMITS.u_min_V <= u.min() <= u.max() <= LIMITS.u_max_V
 
 
-def test_a_long_motion_does_not_drift_away() -> None:
-    """A minute at 1 kHz: what rounds in each sample adds up in the memory, in both precisions alike."""
-    frozen = frozen_of("lssvm")
-    rng = np.random.default_rng(3)
-    motion = motion_of(frozen, [(s, 50, 10, None) for s in rng.uniform(0.0, 1.0, 1000)])
-    expected, _ = voltages(frozen, *motion)
-    for flags in ((), ("-DIT_SINGLE",)):
-        run, error_V, error_single_V = in_c("lssvm", *flags)
-        assert np.abs(run(*motion)[0] - expected).max() <= (error_single_V if flags else error_V)
-    assert error_single_V < 1e-4, "a bound that large says nothing"
-
-
 @pytest.mark.parametrize("before", [math.nan, 0.0, 3.0, 12.0])
 def test_the_limits_are_those_of_the_service(before: float, tmp_path: Path) -> None:
     """From any voltage before, also one outside of the limits, by `limit_voltage` itself."""

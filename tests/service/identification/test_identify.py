@@ -158,19 +158,6 @@ def test_bad_requests_get_a_message_and_status_2(
     assert not (tmp_path / "m.npz").exists()
 
 
-def test_a_recording_without_units_is_refused_and_an_option_mends_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = write(tmp_path / "a.parquet", made_recording(4.0), y_um="y", t_s="time", u_V="drive")
-    arguments = ["identify", str(data), "--out", str(tmp_path / "m.npz"), "--models", "linear", "--no-picture"]
-    names = ["--column", "t=time", "--unit", "t=s", "--column", "u=drive", "--unit", "u=V"]
-    assert main([*arguments, *names]) == 2
-    said = capsys.readouterr().err
-    assert all(part in said for part in ("a.parquet", "'y'", "um, ", "nm", "--unit y=um")), said
-    assert main([*arguments, *names, "--unit", "y=um"]) == 0
-    assert "linear" in capsys.readouterr().out
-
-
 def test_measured_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A piezo stack at 1 Hz; its capacitive sensor lies one sample late. Judged on the last quarter."""
     path = DATA / "picma_stack" / "model_sine_1hz.csv"

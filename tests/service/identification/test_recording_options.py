@@ -41,22 +41,6 @@ def rig(tmp_path: Path) -> Path:
 OPTIONS = ("--unit", "y=um", "--index", "y=*,:", "--repeat", "u", "--dt-s", str(DT_S))
 
 
-def test_one_period_of_the_drive_beside_rows_of_readings_in_another_file(rig: Path) -> None:
-    # Once and for all in a file, the same words; an option goes over the file.
-    recording = load(
-        rig / "drive_V.npy", parsed("--column", "u=drive_V", "--file", f"y={rig / 'sensor.npy'}", *OPTIONS)
-    )
-    np.testing.assert_array_equal(recording.y_um, Y.reshape(-1))
-    np.testing.assert_array_equal(recording.u_V, np.tile(U, PERIODS))
-    (rig / "map.toml").write_text(
-        f'dt_s = {DT_S}\nrepeat = ["u"]\n[files]\ny = "sensor.npy"\n[units]\ny = "um"\n[index]\ny = "*,:"\n'
-    )
-    by_map = load(rig / "drive_V.npy", parsed("--map", str(rig / "map.toml")))
-    np.testing.assert_array_equal(by_map.y_um, recording.y_um)
-    again = load(rig / "drive_V.npy", parsed("--map", str(rig / "map.toml"), "--file", f"y={rig / 'again.npy'}"))
-    np.testing.assert_array_equal(again.y_um, Y[::-1].reshape(-1))
-
-
 def test_a_test_recording_has_files_of_its_own(rig: Path) -> None:
     files = ("--file", f"y={rig / 'sensor.npy'}")
     test_files = ("--test", str(rig / "drive_V.npy"), "--test-file", f"y={rig / 'again.npy'}")

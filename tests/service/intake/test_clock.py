@@ -33,41 +33,7 @@ def test_a_clock_that_is_set_for_good_goes_on_after_some_samples(off_s: float, b
     assert clock.sets == 1
 
 
-def test_times_that_are_wrong_here_and_there_stay_wrong_and_the_others_right() -> None:
-    clock = SampleClock(DT_S)
-    for k in range(400):
-        wrong = k % 3 == 1
-        seen = clock.take(k, k * DT_S + 5.0 * wrong * (1 + k % 7), False)
-        assert (abs(seen - k * DT_S) < 1e-9) == (not wrong)
-    assert clock.sets == 0
-    assert math.isnan(clock.take(400, math.nan, False))
-    assert clock.take(401, 0.401, False) == 0.401
-
-
-def test_a_stage_that_counts_anew_goes_on_at_once_and_lost_samples_are_time() -> None:
-    clock = SampleClock(DT_S)
-    run(clock, 0, 10)
-    assert clock.take(500, 0.5, False) == 0.5
-    assert clock.take(510, 77.0, True) == pytest.approx(0.51)
-    assert clock.take(511, 77.001, False) == pytest.approx(0.511)
-    assert clock.sets == 0
-
-
 ABSURD = [1e300, -1e18, 2.0**62, 1e10, math.inf, -math.inf, math.nan]
-
-
-@pytest.mark.parametrize("t_s", ABSURD)
-@pytest.mark.parametrize("at", [0, 1, 50])
-def test_a_time_that_no_clock_shows_is_none_and_poisons_nothing(t_s: float, at: int) -> None:
-    clock = SampleClock(DT_S)
-    run(clock, 0, at)
-    assert math.isnan(clock.take(at, t_s, False))
-    assert not clock.in_doubt
-    assert run(clock, at + 1, 50) == [k * DT_S for k in range(at + 1, at + 51)]
-    assert clock.sets == 0
-    for k in range(at + 51, at + 551):
-        clock.take(k, t_s, False)
-    assert run(clock, at + 551, 50) == [k * DT_S for k in range(at + 551, at + 601)]
 
 
 @pytest.mark.parametrize("t_s", [*ABSURD, -7.0, 1e6])

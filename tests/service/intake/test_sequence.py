@@ -16,7 +16,6 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.intake.sequence import (
     AHEAD,
     IN_ORDER,
-    JUMPED,
     LATE,
     NEW_COUNT,
     RESTART_AFTER,
@@ -56,19 +55,6 @@ def number(tracker: SequenceTracker) -> int:
     return tracker.number(tracker.last)
 
 
-@pytest.mark.parametrize("ahead", [1002, 100_000, 2**53, MAX_SEQ - 1000])
-@pytest.mark.parametrize("time_of", ["the true number", "its number", "nothing"])
-@pytest.mark.parametrize("count", [1, MOST - 1])
-def test_numbers_far_ahead_are_refused_and_the_true_ones_go_on(ahead: int, time_of: str, count: int) -> None:
-    tracker = begun()
-    false = [(k + ahead, {"the true number": k, "its number": k + ahead, "nothing": math.nan}[time_of] * DT_S)
-             for k in range(1000, 1000 + count)]  # fmt: skip
-    assert taken(tracker, false) == [AHEAD] * count
-    assert taken(tracker, rows(1000, 500)) == [IN_ORDER] * 500
-    assert tracker.counters() == {"received": 1500 + count, "lost": 0, "late": count, "restarts": 0}
-    assert number(tracker) == tracker.last == 1499
-
-
 def test_a_gap_is_taken_at_once_where_the_time_tells_of_it_or_is_none() -> None:
     for t_s in (2.0, math.nan, math.inf):
         tracker = begun()
@@ -86,22 +72,6 @@ def test_a_real_outage_is_borne_out_by_some_samples_and_its_numbers_are_lost(out
     assert taken(tracker, rows(first, 100)) == [AHEAD] * (MOST - 1) + [IN_ORDER] * (101 - MOST)
     assert tracker.counters() == {"received": 1100, "lost": first - 1000, "late": 0, "restarts": 0}
     assert number(tracker) == tracker.last == first + 99
-
-
-@pytest.mark.parametrize("to", [100_000, 2**50, MAX_SEQ - 1000])
-def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to: int) -> None:
-    tracker = begun()
-    jumped = [(to + k, (1000 + k) * DT_S) for k in range(100)]
-    said = taken(tracker, jumped)
-    assert said == [AHEAD] * (MOST - 1) + [JUMPED] + [IN_ORDER] * (100 - MOST)
-    assert number(tracker) == 999 + 1000 + 99
-    assert tracker.restarts == 1
-    assert tracker.lost == 0
-    # And back again, which takes no longer than the false count had lasted four times over.
-    said = taken(tracker, rows(1100, 600))
-    assert said.index(RESTARTED) == RESTART_AFTER - 1
-    assert set(said[RESTART_AFTER:]) == {IN_ORDER}
-    assert number(tracker) == 2098 + 1000 + 599
 
 
 def test_a_first_number_that_is_absurd_gives_way_to_the_next_ones() -> None:
@@ -193,7 +163,7 @@ happenings = st.lists(
 BACK = 2000
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(happenings, st.integers(0, 2**31))
 def test_whatever_happened_good_samples_lead_back(events: list[tuple[Any, int, int]], cut: int) -> None:
     stage: Stage = {"seq": -1, "t_s": 0.0}
@@ -237,7 +207,7 @@ def motion(samples: list[Row]) -> SampleBatch:
     return SampleBatch(seq.astype(np.int64), t_s.astype(float), (y_um - 1.0) / (11.0 * 0.95), y_um)
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(happenings, st.integers(0, 5))
 def test_whatever_happened_a_learner_learns_again(
     models: dict[str, InverseModel], events: list[tuple[Any, int, int]], first_is_wrong: int

@@ -1,6 +1,6 @@
 """A client written from docs/protocol.md alone (`page_client`), over zenoh, beside a real service.
 
-Only the harness that starts the service is ours. One model file is changed as the page tells its form, with numpy.
+Only the harness that starts the service is ours.
 """
 
 from __future__ import annotations
@@ -12,17 +12,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 
-from tests.service.conftest import ServeProcess, unused_port, write_config
-from tests.service.protocol.page_client import Model, decode_query
 from tests.service.protocol.page_client import answer as answer_by_the_page
 from tests.service.protocol.page_client import decode_model as model
+from tests.service.protocol.page_client import decode_query
 from tests.service.protocol.page_client import decode_reply as reply
 
 pytestmark = pytest.mark.e2e
@@ -44,40 +42,6 @@ def connected(endpoint: str) -> Iterator[zenoh.Session]:
 def session(shared_service: Any) -> Iterator[zenoh.Session]:
     with connected(shared_service.endpoint) as opened:
         yield opened
-
-
-def change_model_file(path: Path, name: str, values: dict[str, Any], arrays: dict[str, Any]) -> None:
-    """Other values and arrays for a model of a file, by the page's section about the model file."""
-    with np.load(path) as file:
-        entries = {key: file[key] for key in file.files}
-    header = json.loads(entries["header"].tobytes())
-    header["models"][name]["values"] |= values
-    entries |= {f"{name}/{key}": np.asarray(array, dtype=np.float64) for key, array in arrays.items()}
-    header["models"][name]["arrays"] = sorted({*header["models"][name]["arrays"], *arrays})
-    entries["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    np.savez(path, **entries)
-
-
-FRAME = {"gain": 0.93, "offset_um": 2.5, "dead_um": 0.02}
-ALLOWED_V = 0.3
-
-
-@pytest.fixture(scope="module")
-def bounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zenoh.Session]:
-    """A service whose LSSVM is in a frame of its own and near its bound; nothing learns."""
-    folder, port = tmp_path_factory.mktemp("bounded"), unused_port()
-    config = write_config(folder, port, extra='learn = ""\nserved = "lssvm_adaptive"')
-    with np.load(folder / "x.npz") as file:
-        anchor = file["lssvm_adaptive/beta"].copy()
-    anchor[1] *= 0.8  # by which the bound is active at both ends of the range, and not in its middle
-    values = {"allowed_V": ALLOWED_V, **{f"features.{key}": value for key, value in FRAME.items()}}
-    change_model_file(folder / "x.npz", "lssvm_adaptive", values, {"anchor": anchor})
-    process = ServeProcess(config, port)
-    try:
-        with connected(process.endpoint) as opened:
-            yield opened
-    finally:
-        process.kill()
 
 
 def get(session: zenoh.Session, selector: str, payload: bytes | None = None) -> bytes:
@@ -191,101 +155,6 @@ def test_a_stranger_follows_the_model_as_it_is_published(session: zenoh.Session)
     assert arrived[0]["name"] == "lssvm_adaptive"
     assert arrived[1]["snapshot_seq"] > arrived[0]["snapshot_seq"]
     assert len(arrived[0]["data"]["/memory"]) > 0
-
-
-def lssvm(values: dict[str, Any], data: dict[str, Any], memory: list[float], y: float, v: float, a: float) -> float:
-    """The voltage of one point; ``memory`` advances in place."""
-    (u_V,), _, _, memory[:] = Model("lssvm", values | data, values["features.dt_s"]).evaluate([y], [v], [a], memory)
-    return u_V
-
-
-def test_a_stranger_evaluates_the_lssvm_by_the_formula_of_the_page(session: zenoh.Session) -> None:
-    got = model(get(session, f"{BASE}/model?name=lssvm_adaptive"))
-    values, data = got["values"], got["data"]
-    assert got["kind"] == "lssvm"
-    memory = [0.0] * len(data["/memory"])
-    y = [30.0, 34.0, 33.0, 41.0, 20.0]
-    v = [0.0, 4000.0, -1000.0, 8000.0, -21000.0]
-    a = [0.0, 1e3, -5e3, 0.0, 2e3]
-    mine = [lssvm(values, data, memory, *point) for point in zip(y, v, a, strict=True)]
-    asked = reply(
-        get(session, f"{BASE}/feedforward", query(y, v, a, [0.0] * len(memory), b"lssvm_adaptive", got["snapshot_seq"]))
-    )
-    # The first is free of the slew limit; the others are compared where it did not bite.
-    pairs = [(m, u) for m, u, flag in zip(mine, asked["u_V"], asked["flags"], strict=True) if not flag & 2]
-    assert len(pairs) >= 4
-    for m, u in pairs:
-        assert m == pytest.approx(u, rel=1e-9)
-    assert memory == pytest.approx(asked["memory"], rel=1e-12)
-
-
-MOTION = (
-    [30.0, 34.0, 33.0, 41.0, 20.0, 8.0, 3.0, 15.0, 33.0, 50.0, 67.0, 84.0],
-    [0.0, 4000.0, -1000.0, 8000.0, -21000.0, -12000.0, -5000.0, 12000.0, 18000.0, 17000.0, 17000.0, 17000.0],
-    [0.0, 1e3, -5e3, 0.0, 2e3, 0.0, 1e4, 1e4, 0.0, -1e3, 0.0, 0.0],
-)
-
-
-def test_a_stranger_follows_frame_and_bound(bounded: zenoh.Session) -> None:
-    got = model(get(bounded, f"{BASE}/model"))
-    values, data = got["values"], got["data"]
-    assert (got["name"], got["kind"]) == ("lssvm_adaptive", "lssvm")
-    assert [values[f"features.{key}"] for key in FRAME] == list(FRAME.values())
-    memory, free_memory, size = ([0.0] * len(data["/memory"]) for _ in range(3))
-    points = list(zip(*MOTION, strict=True))
-    mine = [lssvm(values, data, memory, *point) for point in points]
-    free = [lssvm(values, {**data, "anchor": []}, free_memory, *point) for point in points]
-    at_bound = [abs(m - u) > 1e-6 for m, u in zip(mine, free, strict=True)]
-    assert 3 <= sum(at_bound) <= len(points) - 3
-    asked = reply(get(bounded, f"{BASE}/feedforward", query(*MOTION, size)))
-    assert asked["flags"].count(2) <= 1
-    for m, u, flag in zip(mine, asked["u_V"], asked["flags"], strict=True):
-        assert m == pytest.approx(u, rel=1e-9) or flag & 2
-    assert memory == free_memory == pytest.approx(asked["memory"], rel=1e-12)
-
-
-@pytest.mark.parametrize("name", ["linear", "lssvm_adaptive"])
-def test_a_stranger_goes_on_from_what_is_under_way_as_the_service_does(bounded: zenoh.Session, name: str) -> None:
-    got = model(get(bounded, f"{BASE}/model?name={name}"))
-    values, data, k, dt = got["values"], got["data"], 4, got["dt_s"]
-    y, v, a = MOTION[0][4:9], [100.0] * 5, [1e5, 0.0, 0.0, -1e5, 0.0]
-    pending_um, pending_V = [27.0, 25.0, 24.0, 22.0], [2.5, 2.2, 2.1, 2.05]
-    memory = list(data["/memory"])
-
-    def voltage(y_um: float, v_um_per_s: float, a_um_per_s2: float) -> float:
-        if name == "linear":
-            return float((y_um - values["offset_um"]) / values["gain_um_per_V"])
-        return lssvm(values, data, memory, y_um, v_um_per_s, a_um_per_s2)
-
-    for y_um in pending_um[: k - 1]:  # no sample has come: the snapshot has seen none of them
-        voltage(y_um, 0.0, 0.0)
-    p, q, r = pending_um[-1], pending_um[-2], pending_um[-3]
-    j = 6.0 * (y[0] - v[0] * dt + a[0] * dt**2 / 2.0 - p) / dt**3
-    pairs = [
-        (v[0] - a[0] * dt + j * dt**2 / 2.0, a[0] - j * dt),
-        ((p - q) / dt, 0.0),
-        ((y[0] - q) / (2.0 * dt), (v[0] - (p - r) / (2.0 * dt)) / (2.0 * dt)),
-    ]
-    before = list(memory)
-    asked_V = []
-    for pair in pairs:
-        memory[:] = before
-        asked_V.append(voltage(p, *pair))
-    errors = [abs(u - pending_V[-1]) for u in asked_V]
-    memory[:] = before
-    last = voltage(p, *pairs[errors.index(min(errors))])
-    expected = [
-        voltage(*point) + (pending_V[-1] - last) * math.exp(-i * dt / max(0.006, 6.0 * dt))
-        for i, point in enumerate(zip(y, v, a, strict=True), 1)
-    ]
-    payload = query(y, v, a, None, name.encode(), pending=(0, pending_um, pending_V))
-    asked = reply(get(bounded, f"{BASE}/feedforward", payload))
-    assert asked["snapshot_seq"] == -1
-    assert abs(pending_V[-1] - last) > 0.01
-    for m, u, flag in zip(expected, asked["u_V"], asked["flags"], strict=True):
-        assert m == pytest.approx(u, rel=1e-9) or flag & 2
-    assert asked["flags"].count(2) == 0
-    assert memory == pytest.approx(asked["memory"], rel=1e-12)
 
 
 def stage_samples(first: int, n: int, gain: float) -> bytes:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -17,28 +15,21 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.types import InverseModel
-from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.lab.cli import main
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.learner import read_learner_settings
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.samples import SampleBatch
-from dehyst.service.replay import Replayed, replay, sequence, summary, write_gates
+from dehyst.service.replay import Replayed, replay, summary, write_gates
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import BundleMeta, read_bundle, write_bundle
-from dehyst.service.storage.recorder import Recorder, RecorderConfig
-from dehyst.sim.recordings import Recording, read
+from dehyst.sim.recordings import Recording
 from dehyst.sim.signals.voltages import multitone, training_input
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
-DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
-MPI = MpiParameters(
-    tuple(float(r) for r in np.arange(7) * 0.6), (7.0, 1.5, 1.0, 0.5, 0.5, 0.2, 0.1), (0.0, 30.0), (1.0, -0.1)
-)
 
 
 @pytest.fixture(scope="module")
@@ -75,43 +66,6 @@ def samples() -> Recording:
 
 def axis_of(path: Path) -> Axis:
     return load_axis("demo", AxisConfig("x", path, Limits(-2.0, 10.0, 4000.0)))
-
-
-def in_messages(axis: Axis, recording: Recording, size: int) -> dict[int, InverseModel]:
-    """The recording to an axis in messages of ``size`` samples; the snapshots that it published, by number."""
-    seq, published = sequence(recording), {}
-    for start in range(0, len(recording), size):
-        part = slice(start, start + size)
-        axis.handle(SampleBatch(seq[part], recording.t_s[part], recording.u_V[part], recording.y_um[part]))
-        for served in axis.snapshots:
-            published[served.seq] = served.models["lssvm_adaptive"]
-    return published
-
-
-def assert_identical(one: InverseModel, other: InverseModel) -> None:
-    a, b = one.state_dict(), other.state_dict()
-    assert a.keys() == b.keys()
-    for key, value in a.items():
-        assert np.array_equal(np.asarray(value), np.asarray(b[key])), key
-
-
-def test_the_snapshots_are_those_of_the_live_axis_to_the_last_bit(
-    model_file: Path, samples: Recording, tmp_path: Path
-) -> None:
-    live = axis_of(model_file)
-    with Recorder(RecorderConfig(tmp_path / "x")) as recorder:
-        recorder.put(sequence(samples), samples.t_s, samples.u_V, samples.y_um, "x")
-    published = in_messages(live, samples, 7)  # messages of another size than the replay's blocks
-    again: dict[int, InverseModel] = {}
-    replay(read(tmp_path / "x"), axis_of(model_file), on_snapshot=again.__setitem__)
-    compared = sorted(published.keys() & again.keys())
-    assert len(compared) > 280
-    assert set(again) <= set(published)
-    for seq in compared:
-        assert_identical(published[seq], again[seq])
-    learnt = again[compared[-1]]
-    assert isinstance(learnt, LssvmInverse)
-    assert not np.array_equal(learnt.beta, published[-1].state_dict()["beta"])
 
 
 @pytest.fixture(scope="module")
@@ -255,56 +209,6 @@ def test_the_command_says_what_it_lacks(
     assert "--learn" in capsys.readouterr().err
     assert main([*base, "--model", str(model_file), "--dt-s", "0.01"]) == 2
     assert "sample time" in capsys.readouterr().err
-
-
-def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From the identified 1 Hz recording to the ramped sine: the command's whole way on measured data."""
-    folder = DATA / "picma_stack"
-    if not folder.exists():
-        pytest.skip(f"measured data missing: {folder.name}; set DEHYST_DATA to the folder that holds it")
-    config, model = tmp_path / "learner.toml", tmp_path / "stack.npz"
-    config.write_text("window = 300\n", encoding="utf-8")
-    options = ["--sensor-late", "1", "--json"]
-    identify = ["identify", str(folder / "model_sine_1hz.csv"), "--out", str(model), "--models", "lssvm_adaptive"]
-    assert main([*identify, "--no-picture", "--support", "300", *options]) == 0
-    capsys.readouterr()
-    data = str(folder / "test_ramped_sine_ff.csv")
-    command = ["replay", data, "--config", str(config), "--model", str(model), "--out", str(tmp_path / "out")]
-    begin_s = time.process_time()
-    assert main([*command, *options]) == 0
-    took_s = time.process_time() - begin_s
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["scored"] > 14_000
-    assert took_s < 0.5 * printed["duration_s"]
-    assert printed["gates"]["learnt"] > 0
-    assert printed["frozen"]["mae_pct"] < 5.0
-    # What it is for: over the second half the model that learns foretells better than the one it began as.
-    second = printed["over_time"][10:]
-    adaptive, frozen = (float(np.mean([part[name]["mae_pct"] for part in second])) for name in ("adaptive", "frozen"))
-    assert adaptive < 0.4 * frozen
-    for name in ("errors.png", "gates.png"):
-        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
-    assert len(decisions(tmp_path / "out" / "gates.csv")) == printed["samples"]
-
-
-@pytest.mark.parametrize("missing", [3, 60])
-def test_a_short_gap_costs_nothing_soon_after_it(
-    model_file: Path, samples: Recording, replayed: Replayed, missing: int
-) -> None:
-    """60 missing samples used to raise the error for the rest of the recording."""
-    keep = np.ones(len(samples), dtype=np.bool_)
-    keep[4000 : 4000 + missing] = False
-    seq = sequence(samples)
-    cut = Recording(samples.t_s[keep], samples.u_V[keep], samples.y_um[keep], DT_S, source="gap", seq=seq[keep])
-    whole, gapped = replayed, replay(cut, axis_of(model_file))
-    assert gapped.t_s.size == whole.t_s.size
-    assert np.isnan(gapped.adaptive_V[4003 : 4000 + missing]).all()
-    # A gap that is bridged costs nothing. After a longer one the memory is found within a second.
-    after = slice((4100 if missing < 10 else 5000) + missing, None)
-    for with_gap, without in ((gapped.adaptive_V, whole.adaptive_V), (gapped.frozen_V, whole.frozen_V)):
-        rms = [float(np.sqrt(np.nanmean(error[after] ** 2))) for error in (with_gap, without)]
-        assert rms[0] < 1.5 * rms[1]
-    assert np.isfinite(gapped.adaptive_V[:4000]).sum() > 3900
 
 
 def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path) -> None:

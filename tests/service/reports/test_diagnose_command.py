@@ -25,7 +25,7 @@ from dehyst.sim.diagnosis.result import NamedCause, picture
 from dehyst.sim.effects import CAUSES, Chain, effect, simulate
 from dehyst.sim.fitting.fit_data import FitData
 from dehyst.sim.pictures import MEASURED, WITH, WITHOUT
-from dehyst.sim.stage.file import load_stage, save_stage
+from dehyst.sim.stage.file import load_stage
 from dehyst.sim.stage.stage import Stage
 
 DT_S = 1e-3
@@ -129,24 +129,6 @@ def test_the_extended_stage_runs_and_makes_the_same_readings(
     assert json.loads(ended.stdout.splitlines()[-1])["units"]["x"]["published"] == 200
 
 
-def test_the_extended_stage_runs_in_the_demonstration(report: tuple[Path, dict[str, Any], str], tmp_path: Path) -> None:
-    out, _, _ = report
-    # Without a loop there is nothing to identify plays by; the chapter's stage stands for the nominal here.
-    config = load_stage(out / "stage.toml")
-    loop = effect("hysteresis_shape", width_um=6.0, largest_V=2.0, fading=1.0)
-    save_stage(
-        type(config)("own", config.effects + loop, dt_s=config.dt_s, u_min_V=0.0, u_max_V=8.0), tmp_path / "s.toml"
-    )
-    ended = dehyst(
-        "demo", "--fast", "--duration", "8", "--stage", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--json"
-    )
-    assert ended.returncode == 0, ended.stderr
-    summary = json.loads(ended.stdout)
-    assert summary["change"]["gain"] == -0.06
-    assert summary["models"]["lssvm_adaptive"]["settled"]["mae_pct"] < 3.0
-    assert summary["samples"]["learnt"] > 1000
-
-
 def test_what_cannot_be_diagnosed_is_refused_with_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,15 +200,3 @@ def test_every_cause_has_a_picture_on_every_record(name: str, kind: str) -> None
         assert not shown.log_x or (curve.x > 0.0).all()
     roles = {curve.role for curve in shown.curves}
     assert {WITHOUT, WITH} <= roles or roles == {MEASURED}
-
-
-def test_creep_is_a_straight_line_over_the_logarithm_of_time() -> None:
-    u = drive(1)
-    data = FitData(DT_S, u, 10.0 * u)
-    since = np.maximum(np.arange(u.size) - 1000, 0) * DT_S
-    before = np.where(u == 3.0, 0.3 * np.log10(np.maximum(since, 1e-3) / 0.01), 0.0)
-    shown = picture(NamedCause("creep", (), {}, {}, 0.5, 0.001, before, 0.0 * before), data)
-    assert shown.log_x
-    without = next(c for c in shown.curves if c.role == WITHOUT and "3 V" in c.note)
-    slope, _ = np.polyfit(np.log10(without.x), without.y, 1)
-    assert slope == pytest.approx(300.0, rel=0.1)

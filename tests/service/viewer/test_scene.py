@@ -116,9 +116,6 @@ def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: lis
     assert join.take(everything=True) is None
 
 
-# -- planes ------------------------------------------------------------------------------------------------------
-
-
 # -- scene -------------------------------------------------------------------------------------------------------
 
 

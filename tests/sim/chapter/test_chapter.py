@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import os
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
-from dehyst.baselines import fit_bouc_wen
 from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from dehyst.baselines.common import Domain
 from dehyst.sim.chapter import published
 from dehyst.sim.chapter.control import (
     BlockConfig,
-    changing,
     chapter_reference,
     learner_of,
     replay,
@@ -27,7 +24,7 @@ from dehyst.sim.chapter.control import (
 )
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments
 from dehyst.sim.chapter.forward_lssvm import fit_two_inputs
-from dehyst.sim.chapter.modelling import ForwardRun, identify_forward, refine_bouc_wen
+from dehyst.sim.chapter.modelling import identify_forward, refine_bouc_wen
 from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.closed_loop import track
 from dehyst.sim.stage.presets import preset
@@ -46,11 +43,6 @@ def rich() -> Experiments:
 @pytest.fixture(scope="module")
 def chapter() -> Experiments:
     return experiments("bouc_wen", quick=True)
-
-
-@pytest.fixture(scope="module")
-def chapter_runs(chapter: Experiments) -> list[ForwardRun]:
-    return identify_forward(chapter, pso=find_spec("torch") is not None, epochs=80)
 
 
 def test_scores_are_those_of_the_equations() -> None:
@@ -135,21 +127,6 @@ def test_memory_is_what_makes_the_difference_on_the_rich_stage(rich: Experiments
     assert two.third_mae_pct > 2.0
 
 
-def test_bouc_wen_wins_the_modelling_table_where_it_is_the_truth(chapter_runs: list[ForwardRun]) -> None:
-    for part in ("training", "generalisation"):
-        best = min(chapter_runs, key=lambda run: getattr(run, part).mae_pct)
-        assert best.key == "bouc_wen"
-        assert getattr(best, part).rmse_pct < 0.01
-
-
-def test_swarms_come_near_the_better_route(chapter_runs: list[ForwardRun]) -> None:
-    pytest.importorskip("torch")
-    runs = {run.key: run for run in chapter_runs}
-    assert runs["mpi_pso"].training.rmse_pct < 2.0 * runs["mpi"].training.rmse_pct
-    assert runs["bouc_wen_pso"].training.rmse_pct < 2.0
-    assert runs["bouc_wen"].training.rmse_pct < runs["bouc_wen_pso"].training.rmse_pct
-
-
 # --- Control experiments of the chapter, frozen and learning.
 
 
@@ -181,16 +158,6 @@ def test_blocks_of_a_model_that_does_not_learn_equal_one_run() -> None:
     whole = track(stage, reference, model=online.snapshot())
     np.testing.assert_allclose(blocks.u_V, whole.u_V, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(blocks.y_um, whole.y_um)
-
-
-def test_learning_is_deterministic_and_catches_a_gain_change() -> None:
-    stage = Stage(changing(preset("bouc_wen"), 1.0))
-    reference = sine_reference(70.0, 2.0, 4.0)
-    runs = [track_learning(stage, reference, learner_of(inverse())) for _ in range(2)]
-    np.testing.assert_array_equal(runs[0].y_um, runs[1].y_um)
-    frozen = track(stage, reference, model=inverse())
-    late = slice(2500, None)
-    assert np.mean(np.abs(runs[0].error_um[late])) < 0.1 * np.mean(np.abs(frozen.error_um[late]))
 
 
 def test_snapshot_that_answers_has_not_seen_its_block() -> None:
@@ -229,13 +196,3 @@ def test_control_on_the_rich_stage_meets_its_targets() -> None:
     assert after["lssvm_adaptive"] < min(after["bouc_wen_online"], after["mpi_online"])
     with pytest.raises(InputError, match="no run"):
         control.loop("mpi", "FF", "nothing")
-
-
-def test_an_identified_bouc_wen_is_exact_on_its_own_stage() -> None:
-    data = experiments("bouc_wen", quick=True)
-    model = fit_bouc_wen(data.training.u_V, data.training.y_um, DT_S)[0]
-    run = track(Stage(data.config), chapter_reference(data.range_um), model=model)
-    assert Score.of(run.error_um, data.range_um).mae_pct < 0.01
-
-
-# --- Min-max normalisation and its inverse.

@@ -175,16 +175,6 @@ def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
     assert "swapped" not in kinds(negative)
 
 
-def test_exchanged_columns_of_a_recording_that_ends_away_from_its_start_are_refused() -> None:
-    part = healthy().part(0, 250)
-    part = replace(part, u_V=150.0 / np.ptp(part.u_V) * part.u_V)
-    assert abs(part.u_V[-1] - part.u_V[0]) > 0.5 * np.ptp(part.u_V)
-    assert "swapped" not in kinds(part)
-    exchanged = replace(part, u_V=part.y_um, y_um=part.u_V)
-    assert kinds(exchanged)["swapped"] == "refusal"
-    assert lead(part.y_um, part.u_V) == pytest.approx(-lead(part.u_V, part.y_um))
-
-
 def test_a_displacement_that_is_a_line_of_the_voltage_is_refused() -> None:
     base = healthy()
     coarse = np.round(base.u_V / 0.003) * 0.003

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import logging
-import os
 import sys
 import zlib
 from collections.abc import Callable
@@ -114,12 +113,6 @@ def write_xlsx(path: Path, **sheets: list[list[Any]]) -> Path:
 # Text without a header.
 
 
-def test_text_without_names_by_position(tmp_path: Path) -> None:
-    recording = read(write_text(tmp_path / "a.csv"), BY_POSITION)
-    same(recording)
-    assert any("called by their position, from 1" in note for note in recording.notes)
-
-
 def test_names_in_the_comment_above_as_numpy_writes_them(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "a.txt", TABLE, header="t_s u_V y_um", fmt="%.17g")
     recording = read(tmp_path / "a.txt")
@@ -146,13 +139,6 @@ def test_a_line_of_units_below_the_names(tmp_path: Path) -> None:
     assert "units from line 2: time in s, drive in V, sensor in Micrometers" in recording.notes
     with pytest.raises(InputError, match=r"states the unit 'Micrometers', expected one of V"):
         read(path, ColumnMap(columns={"t": "time", "u": "sensor", "y": "drive"}))
-
-
-def test_a_column_that_stands_there_twice_is_chosen_by_position(tmp_path: Path) -> None:
-    path = write_text(tmp_path / "a.csv", "time_s,Volt,Volt")
-    with pytest.raises(InputError, match=r"holds time_s, Volt \(column 2\), Volt \(column 3\)"):
-        read(path, ColumnMap(columns={"t": "1", "u": "Volt", "y": "3"}))
-    same(read(path, ColumnMap(columns={"t": "1", "u": "2", "y": "3"}, units={"u": "V", "y": "um"})))
 
 
 @pytest.mark.parametrize(
@@ -245,17 +231,6 @@ def test_two_files_with_a_time_each_must_agree(tmp_path: Path) -> None:
         read(main, ColumnMap(files={"y": fast}))
 
 
-def test_a_time_in_the_second_file_serves_both(tmp_path: Path) -> None:
-    main = write_npy(tmp_path / "u_V.npy", U)
-    other = write_text(tmp_path / "b.csv", "t_s,y_um", table=np.column_stack([T, Y]))
-    same(read(main, ColumnMap(files={"y": other})))
-    # By position, the time of one file is no time in a file that has the sensor there.
-    clock = write_text(tmp_path / "c.csv", table=np.column_stack([T, U]))
-    single = write_text(tmp_path / "d.csv", table=Y.reshape(-1, 1))
-    mapping = ColumnMap(columns={"t": "1", "u": "2"}, files={"y": single}, units={"t": "s", **UNITS})
-    same(read(clock, mapping))
-
-
 def test_a_missing_second_file_and_a_missing_column_in_it(tmp_path: Path) -> None:
     main = write_npy(tmp_path / "u_V.npy", U)
     with pytest.raises(InputError, match=r"none\.csv: cannot be read"):
@@ -304,17 +279,6 @@ def test_contradictory_lengths_are_never_repeated_by_themselves(tmp_path: Path) 
     for quantity in ("t", "dt", "z"):
         with pytest.raises(InputError, match="repeat: got"):
             ColumnMap(repeat=(quantity,))
-
-
-def test_readings_of_each_period_in_a_column_of_its_own(tmp_path: Path) -> None:
-    table = np.column_stack([U[:60], Y.reshape(4, 60).T])
-    path = write_text(tmp_path / "a.csv", "drive_V,p1,p2,p3,p4", table=table)
-    mapping = ColumnMap(columns={"u": "1", "y": "2:5"}, units={"y": "um"}, index={"y": ":,*"}, repeat=("u",), dt_s=DT_S)
-    recording = read(path, mapping)
-    np.testing.assert_array_equal(recording.y_um, Y)
-    np.testing.assert_array_equal(recording.u_V, np.tile(U[:60], 4))
-    with pytest.raises(InputError, match=r"shape \(60, 4\).*--index y="):
-        read(path, ColumnMap(columns=mapping.columns, units={"y": "um"}, repeat=("u",), dt_s=DT_S))
 
 
 @settings(max_examples=40, deadline=None)
@@ -446,9 +410,6 @@ def test_a_name_and_a_stated_unit_that_differ_are_refused(tmp_path: Path) -> Non
     with pytest.raises(InputError, match=r"states the unit 'um' and its name says nm.*--unit y=um or y=nm"):
         read(path)
     same(read(path, ColumnMap(units={"y": "nm"})), rtol=1e-15)
-
-
-# LVM.
 
 
 # Excel.
@@ -647,18 +608,6 @@ def test_map_file_with_files_positions_and_periods(tmp_path: Path) -> None:
         (folder / "map.toml").write_text(text)
         with pytest.raises(InputError, match=message):
             load_map(folder / "map.toml")
-
-
-def test_measured_periods_of_the_mirror() -> None:
-    data_dir = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
-    if not data_dir.is_dir():
-        pytest.skip(f"no measured data at {data_dir} (DEHYST_DATA)")
-    path = data_dir / "fine_steering_mirror" / "fsm_100mV_test.npz"
-    mapping = ColumnMap(columns={"u": "u", "rate": "fs_hz"}, units={"u": "V"}, index={"u": ":,2,1,*", "y": ":,2,1,*"})
-    recording = read(path, mapping)
-    with np.load(path) as archive:
-        np.testing.assert_array_equal(recording.y_um[8192:], archive["y_um"][:, 2, 1, 1])
-    assert len(recording) == 2 * 8192
 
 
 def test_nothing_is_logged_or_printed_by_the_packages(

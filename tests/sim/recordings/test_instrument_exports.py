@@ -11,7 +11,7 @@ import pytest
 
 from dehyst.adaptive.errors import InputError
 from dehyst.sim.recordings import ColumnMap, Recording, read
-from dehyst.sim.recordings.columns import MissingError, unit_of_name
+from dehyst.sim.recordings.columns import MissingError
 
 N, DT_S = 300, 1e-3
 T = np.arange(N) * DT_S
@@ -48,17 +48,6 @@ def test_encodings_delimiters_and_units_in_names(tmp_path: Path, encoding: str, 
     assert ("decimal commas" in said) == (sep != ",")
     assert ("letters in" in said) == (encoding not in ("utf-8", "utf-8-sig"))
     assert "u is the column 'Spannung [V]', by its unit" in said
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [
-        ("Voltage (V)", "V"), ("Voltage [mV]", "mV"), ("U / kV", "kV"), ("drive_V", "V"), ("Drive, Volts", "V"),
-        ("drive in mV", "mV"), ("Voltage", None), ("V", None), ("Position (nm)", None), ("u (W)", None),
-    ],
-)  # fmt: skip
-def test_units_of_a_voltage_in_names(name: str, unit: str | None) -> None:
-    assert unit_of_name("u", name) == unit
 
 
 def test_all_that_is_missing_in_one_message(tmp_path: Path) -> None:

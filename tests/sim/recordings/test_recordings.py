@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
-from scipy.io import savemat
 
 from dehyst.adaptive.errors import InputError
 from dehyst.sim.recordings import ColumnMap, Recording, load_map, read
@@ -43,32 +42,12 @@ def test_canonical_csv(tmp_path: Path) -> None:
     assert len(recording.sha256) == 64
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
-def test_text_by_its_delimiter_with_comments_before_the_header(tmp_path: Path, delimiter: str) -> None:
-    path = write_csv(tmp_path / "a.txt", delimiter.join(["t_s", "u_V", "y_um"]), T, U, Y, delimiter=delimiter)
-    path.write_text("# rig 7\n% made by hand\n\n" + path.read_text())
-    same(read(path))
-
-
-def test_a_unit_in_the_name_is_believed(tmp_path: Path) -> None:
-    same(read(write_csv(tmp_path / "a.csv", "t_ms,u_mV,y_nm", T * 1e3, U * 1e3, Y * 1e3)))
-    mapping = ColumnMap(columns={"t": "time [ms]", "u": "drive (mV)", "y": "pos_nm"})
-    same(read(write_csv(tmp_path / "b.csv", "time [ms],drive (mV),pos_nm", T * 1e3, U * 1e3, Y * 1e3), mapping))
-
-
 def test_scale_in_place_of_a_unit_and_kelvin(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "a.csv", "t_s,u_V,sensor_V,temperature_K", T, U, Y / 10.0, np.full(N, 293.15))
     recording = read(path, ColumnMap(columns={"y": "sensor_V"}, scale={"y": 10.0}))
     same(recording)
     assert recording.temperature_C is not None
     np.testing.assert_allclose(recording.temperature_C, 20.0)
-
-
-def test_sample_time_by_option_where_there_is_no_time_column(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", "u_V,y_um", U, Y)
-    same(read(path, ColumnMap(dt_s=0.002)))
-    with pytest.raises(InputError, match=r"no time.*--dt-s"):
-        read(path)
 
 
 def test_parquet_with_timestamps(tmp_path: Path) -> None:
@@ -85,12 +64,6 @@ def test_a_folder_of_segments_is_one_recording(tmp_path: Path) -> None:
     same(recording)
     assert recording.reason is not None
     assert recording.notes == ("2 segments",)
-
-
-def test_mat_with_structures_and_columns(tmp_path: Path) -> None:
-    savemat(tmp_path / "a.mat", {"t_s": T.reshape(-1, 1), "rec": {"u": U.reshape(-1, 1), "y": Y * 1e3}, "name": "rig"})
-    mapping = ColumnMap(columns={"u": "rec.u", "y": "rec.y"}, units={"u": "V", "y": "nm"})
-    same(read(tmp_path / "a.mat", mapping))
 
 
 def test_mat_7_3_without_its_data_is_refused(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import NumericsError
-from dehyst.adaptive.types import Feedforward, FloatArray, StateDict
 from dehyst.sim.effects import Chain, effect
 from dehyst.sim.signals.references import demo_reference
 from dehyst.sim.stage.closed_loop import PID, track, ultimate_gain
@@ -17,28 +16,6 @@ from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
 DT = 1e-3
-
-
-@dataclasses.dataclass(frozen=True)
-class Gain:
-    """The inverse of a straight line."""
-
-    um_per_V: float
-    dt_s: float = DT
-    name: str = "gain"
-    memory_size: int = 0
-
-    def rest_memory(self, y_um: float) -> FloatArray:
-        return np.zeros(0)
-
-    def feedforward(self, y_um: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray) -> Feedforward:
-        return Feedforward(y_um / self.um_per_V, np.zeros_like(y_um), np.ones(y_um.size, bool), memory)
-
-    def track(self, y: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, memory: FloatArray) -> FloatArray:
-        return memory
-
-    def state_dict(self) -> StateDict:
-        return {}
 
 
 def test_pid_is_the_increment_of_the_chapter() -> None:
@@ -56,20 +33,6 @@ def test_pid_is_the_increment_of_the_chapter() -> None:
         for _ in range(round(0.5 / dt)):
             p.step(s, 0.1)
         assert s.u_V == pytest.approx(20.0 * 0.1 * 0.5)
-
-
-def test_feedback_removes_what_feedforward_leaves() -> None:
-    reference = demo_reference(4.0, DT, (5.0, 60.0), seed=1)
-    stage = Stage(preset("rich"))
-    pid = PID(k_p=0.0, k_i=20.0)
-    model = Gain(10.8)
-    ff = track(stage, reference, model=model)
-    fb = track(stage, reference, pid=pid)
-    both = track(stage, reference, model=model, pid=pid)
-    errors = [np.abs(run.error_um[1000:]).mean() for run in (ff, fb, both)]
-    assert errors[2] < 0.6 * errors[1] < 0.6 * errors[0]
-    np.testing.assert_allclose(both.u_V, both.feedforward_V + both.feedback_V, atol=1e-12)
-    assert ff.feedback_V.tolist() == [0.0] * 4000
 
 
 def test_no_wind_up_at_the_limits() -> None:

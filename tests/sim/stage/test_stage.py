@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
 from dehyst.sim.effects import EFFECTS, Chain
-from dehyst.sim.signals.voltages import growing_triangles, training_input, triangle
+from dehyst.sim.signals.voltages import training_input, triangle
 from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.file import from_dict, load_stage, save_stage, to_dict
 from dehyst.sim.stage.presets import preset, rich_chain
@@ -202,15 +202,3 @@ def test_rich_has_the_chapters_range_and_loops() -> None:
     assert 1.04 * slow < fast < 1.2 * slow
     heights = [loops(config, 0.0, v, 1.0)[0] * loops(config, 0.0, v, 1.0)[1] for v in (2.0, 4.0, 6.0, 8.0)]
     assert np.all(np.diff(heights) > 0.5)
-
-
-def test_bouc_wen_preset_has_the_lag_of_table_2_1() -> None:
-    stage = Stage(preset("bouc_wen"))
-    step = stage.run_traced(stage.initial_state(), np.full(200, 1.0)).true_um
-    # overdamped: 1 - e^(-t k/b), k/b = 395.8 rad/s
-    at = np.arange(200) * DT
-    np.testing.assert_allclose(step / step[-1], 1.0 - np.exp(-395.8 * at), atol=2e-3)
-    t, u = growing_triangles()
-    y, _ = stage.run(stage.initial_state(), u)
-    assert y.max() == pytest.approx(11.351 * 8.0 - 0.4754 * 11.351 / (0.8718 + 0.9925), abs=0.3)
-    assert t.size == u.size
