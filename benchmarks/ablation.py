@@ -1,4 +1,4 @@
-"""What each rule and each constant of the learner is worth: without the rule, and with half and twice the constant.
+"""What each rule of the learner is worth: without the rule.
 
 ``python -m benchmarks.ablation --json out/ablation.jsonl`` runs the learner as it is over short cases, then once for
 each variant, and prints what gets worse. A variant without any row that gets worse beyond chance is worth nothing on
@@ -6,10 +6,8 @@ these cases. The file is continued where it ends, if the code of the learner and
 
 Variants
 --------
-rules : those of `RULES` are switched off, one at a time.
-constants : numbers at the level of the modules of ``adaptive/online``, found in their source; half and twice, integers
-    rounded, of a pair each number by itself, of longer tuples all numbers at once. 0 has no factor and stays.
-fields (``--fields``) : the numbers of the learner's frozen configuration, likewise.
+rules : those of `RULES` are switched off, one at a time, each in a process forked from this one.
+fields (``--fields``) : half and twice each number of the learner's frozen configuration, integers rounded.
 
 Cases
 -----
@@ -31,46 +29,35 @@ chance), and the geometric mean grows by ``LEAST`` too; or where the verdict get
 gets better, and in more than it does by other noise. The table says how many rows other noise alone makes worse by
 this rule. The learner is deterministic: equal numbers are equal for sure. Where no row is worse, but a single case is
 by more than ``CUT`` times what chance does to it, or a verdict is, it is open what the rule is worth: run more cases.
-
-How a constant is shifted
--------------------------
-In a process forked from this one, in all modules that import it. Compiled functions that read it, and those that call
-them, are compiled anew, since compiled code does not see a changed constant. A case that goes through no line that
-reads the constant gives the same numbers, and is not run. A constant that is read while a module is imported is not
-shifted, and the table says so.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import dis
 import functools
+import gc
 import hashlib
 import itertools
-import json
 import math
 import multiprocessing
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from types import CodeType, FrameType, ModuleType
 from typing import Any, Final, Protocol
 from unittest import mock
 
-import numba
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 import dehyst.adaptive.online
 from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
-from benchmarks.measured import RECORDS, Cut, data_folder, replayed
+from benchmarks.measured import RECORDS, Cut, data_folder, learnt
+from benchmarks.records import add_line, read_lines
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
@@ -78,9 +65,8 @@ from dehyst.adaptive.online.drift import DriftConfig, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow
-from dehyst.adaptive.online.learner import Judgement, Learner, Parts
-from dehyst.adaptive.smoothing import smooth_recording
-from dehyst.adaptive.types import FloatArray, InverseModel, Sample
+from dehyst.adaptive.online.learner import Judgement, Parts
+from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.lab.rehearsal import (
     SENSOR,
     Event,
@@ -93,7 +79,6 @@ from dehyst.lab.rehearsal import (
 )
 from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.answers.guard import Limits
-from dehyst.service.config.learner import learner_config
 from dehyst.service.config.settings import LEARN
 from dehyst.service.identification.identifying import Stretch, identify_one
 from dehyst.service.reports.tables import markdown
@@ -203,35 +188,17 @@ class RecordCase:
     @classmethod
     def of(cls, cut: Cut, name: str) -> RecordCase:
         """Raises what an identification raises."""
-        smoother, n = LearnerConfig().smoother(cut.dt_s), cut.split
-        last = min(cut.u_V.size, n + SAMPLES + 2 * LATER)
-        pieces = [slice(0, n), slice(n, last)] if cut.jump else [slice(0, last)]
-        moved = np.concatenate([smooth_recording(cut.y_um[piece], smoother) for piece in pieces])
-        u_V, y_um = cut.u_V[:last], cut.y_um[:last]
-        whole = Stretch(u_V, y_um, moved, np.ones(u_V.size, dtype=np.bool_))
-        model = identify_one(LEARN, u_V[:n], y_um[:n], cut.dt_s, 500)
+        last = min(cut.u_V.size, cut.split + SAMPLES + 2 * LATER)
+        cut = replace(cut, u_V=cut.u_V[:last], y_um=cut.y_um[:last])
+        train_V = cut.u_V[: cut.split]
+        model = identify_one(LEARN, train_V, cut.y_um[: cut.split], cut.dt_s, 500)
         assert isinstance(model, LssvmInverse)
-        (u_low, u_high), (y_low, y_high) = (
-            (float(x.min() - 0.25 * np.ptp(x)), float(x.max() + 0.25 * np.ptp(x))) for x in (u_V, y_um)
-        )
-        limits = Limits(u_low, u_high, math.inf, y_low, y_high)
-        return cls(name, "record", model, whole.part(n, last), cut.dt_s, limits, float(np.ptp(u_V[:n])))
+        test = cut.whole().part(cut.split, last)
+        return cls(name, "record", model, test, cut.dt_s, cut.limits(), float(np.ptp(train_V)))
 
     def run(self, noise: int, settings: Settings) -> Numbers:
         test, dt_s = self.test.part(noise * LATER, len(self.test)), self.dt_s
-        made = Learner.from_model(self.model, learner_config(settings, self.limits, "learner"))
-        said: list[str] = []
-
-        def teach(part: slice) -> None:
-            for k in range(part.start, part.stop):
-                said.append(made.handle(Sample(k, k * dt_s, float(test.u_V[k]), float(test.y_um[k]))))
-
-        def newest() -> tuple[int, InverseModel, FloatArray] | None:
-            snapshot = made.snapshot()
-            memory = made.memory_for(snapshot)
-            return None if memory is None else (made.seq, snapshot, memory)
-
-        got = replayed(test, dt_s, teach, newest, lambda _seq, at, memory, to: at.feedforward(*to, memory).u_V)
+        got, said = learnt(self.model, test, dt_s, self.limits, settings)
         first = round(SKIPPED * len(test))
         error_pct = np.nan_to_num(100.0 / self.span_V * np.abs(got - test.u_V)[first:])
         refused = float(np.mean([name not in TAKEN for name in said[first:]]))
@@ -275,268 +242,6 @@ def _fits(name: str, seed: int, slow: bool) -> bool:
     return round(1.0 / traits.dt_s) == (500 if slow else 1000) and not (rings and name in MOTIONS)
 
 
-# --- Constants in the source.
-
-
-@dataclass(frozen=True, slots=True)
-class Constant:
-    """A number at the level of a module. ``at``: its place in a pair; None for a number, or for all of a tuple."""
-
-    module: str
-    name: str
-    value: Any
-    at: int | None = None
-
-    @property
-    def label(self) -> str:
-        place = "" if self.at is None else f"[{self.at}]"
-        return f"{self.module.rpartition('.')[2]}.{self.name}{place}"
-
-    @property
-    def present(self) -> Any:
-        """What a shift changes."""
-        return self.value if self.at is None else self.value[self.at]
-
-    def shifted(self, factor: float) -> Any:
-        """The new value of the module's name."""
-        if self.at is not None:
-            return tuple(scaled(x, factor) if i == self.at else x for i, x in enumerate(self.value))
-        if isinstance(self.value, tuple):
-            return tuple(scaled(x, factor) for x in self.value)
-        return scaled(self.value, factor)
-
-
-def scaled(value: float, factor: float) -> float:
-    """A number times a factor; an integer rounded, but moved by one at least."""
-    if not isinstance(value, int):
-        return value * factor
-    moved = round(value * factor)
-    return moved if moved != value or not value else value + (1 if factor > 1.0 else -1)
-
-
-#: Numbers that stand for nothing, or for a place in an array.
-NO_CONSTANTS: Final = frozenset({"NOWHERE"})
-
-
-def constants_of(text: str, module: str) -> list[Constant]:
-    """The numbers, and tuples of numbers, that a module assigns in its source."""
-    found = []
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign):
-            targets, value = node.targets, node.value
-        elif isinstance(node, ast.AnnAssign) and node.value is not None:
-            targets, value = [node.target], node.value
-        else:
-            continue
-        for target in targets:
-            names, values = [target], [value]
-            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
-                names, values = target.elts, value.elts
-            for name, one in zip(names, values, strict=True):
-                if isinstance(name, ast.Name) and name.id not in NO_CONSTANTS:
-                    found.extend(_constants(module, name.id, _number(one)))
-    return found
-
-
-def _constants(module: str, name: str, value: Any) -> Iterator[Constant]:
-    if isinstance(value, tuple) and len(value) == 2:
-        yield from (Constant(module, name, value, at) for at in (0, 1) if value[at])
-    elif value is not None and (any(value) if isinstance(value, tuple) else value):
-        yield Constant(module, name, value)
-
-
-def _number(node: ast.expr) -> Any:
-    """The number or the tuple of numbers that a literal stands for; None for anything else."""
-    try:
-        value = ast.literal_eval(node)
-    except (ValueError, TypeError):
-        return None
-    parts = value if isinstance(value, tuple) else (value,)
-    return value if parts and all(isinstance(x, int | float) and not isinstance(x, bool) for x in parts) else None
-
-
-#: The order in which modules are taken; any other one comes after them.
-ORDER: Final = (
-    "sensor_trust", "intake", "glitch_or_jump", "learner", "dead_reckoning", "missing_motion", "gates", "drift"
-)  # fmt: skip
-
-
-def all_constants() -> list[Constant]:
-    """Those of the modules of ``adaptive/online``."""
-    folder = Path(dehyst.adaptive.online.__file__).parent
-    modules = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
-    modules.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
-    return [
-        constant
-        for name in modules
-        for constant in constants_of((folder / f"{name}.py").read_text(), f"dehyst.adaptive.online.{name}")
-    ]
-
-
-# --- Who reads a constant, and how it is shifted.
-
-#: Packages in which readers are looked for.
-PACKAGES: Final = ("dehyst", "benchmarks", "tests")
-#: A line of a file. A function is entered at its first line.
-Place = tuple[str, int]
-
-
-def place_of(code: CodeType) -> Place:
-    return code.co_filename, code.co_firstlineno
-
-
-def lines_of(code: CodeType, names: Collection[str]) -> frozenset[Place]:
-    """The lines of a function on which one of the names is read, as a name or as an attribute."""
-    return frozenset(
-        (code.co_filename, at.positions.lineno)
-        for at in dis.get_instructions(code)
-        if at.opname.startswith("LOAD_") and at.argval in names and at.positions and at.positions.lineno
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Loaded:
-    """A loaded module of the project: its functions, what it imports by name (local name -> origin), and the names
-    that are read while it is imported."""
-
-    module: ModuleType
-    codes: tuple[CodeType, ...]
-    imported: dict[str, tuple[str, str]]
-    modules: frozenset[str]
-    at_import: frozenset[str]
-
-    @classmethod
-    def of(cls, module: ModuleType, path: str) -> Loaded:
-        text = Path(path).read_text()
-        tree = ast.parse(text)
-        imported, modules = {}, set[str]()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                for alias in node.names:
-                    imported[alias.asname or alias.name] = (node.module, alias.name)
-                    modules.add(f"{node.module}.{alias.name}")
-            elif isinstance(node, ast.Import):
-                modules.update(alias.name for alias in node.names)
-        codes = tuple(_functions(compile(text, path, "exec")))
-        return cls(module, codes, imported, frozenset(modules), frozenset(_read_at_import(tree)))
-
-
-def _functions(code: CodeType) -> Iterator[CodeType]:
-    """All functions in a code object, themselves in functions or not."""
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            if inner.co_flags & 0x2:  # CO_NEWLOCALS: a function, not the body of a class
-                yield inner
-            yield from _functions(inner)
-
-
-def _read_at_import(node: ast.AST) -> Iterator[str]:
-    """Names that are read outside of functions; annotations are not evaluated."""
-    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
-        yield node.id
-    elif isinstance(node, ast.Attribute):
-        yield node.attr
-    parts: Iterable[ast.AST] = ast.iter_child_nodes(node)
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-        parts = [*node.decorator_list, *node.args.defaults, *(d for d in node.args.kw_defaults if d)]
-    elif isinstance(node, ast.Lambda):
-        parts = []
-    elif isinstance(node, ast.AnnAssign):
-        parts = [node.value] if node.value else []
-    for part in parts:
-        yield from _read_at_import(part)
-
-
-@functools.cache
-def loaded() -> dict[str, Loaded]:
-    """The loaded modules of the project by name."""
-    found = {}
-    for name, module in list(sys.modules.items()):
-        path = vars(module).get("__file__")
-        if name.partition(".")[0] in PACKAGES and path:
-            found[name] = Loaded.of(module, path)
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Readers:
-    """Where a name is read.
-
-    names : (module, local name) under which it is bound. places : lines that read it, or that call compiled code which
-    does. compiled : the names of compiled functions to be compiled anew, callees first. at_import : modules that
-    read it while they are imported.
-    """
-
-    names: tuple[tuple[str, str], ...]
-    places: frozenset[Place]
-    compiled: tuple[tuple[str, str], ...]
-    at_import: tuple[str, ...]
-
-
-def bound_as(module: str, name: str) -> list[tuple[str, str]]:
-    """(module, local name) of all names that a module's name is bound to by imports, itself first."""
-    names = [(module, name)]
-    for origin in names:
-        names += [
-            (other, local)
-            for other, it in loaded().items()
-            for local, source in it.imported.items()
-            if source == origin and (other, local) not in names
-        ]
-    return names
-
-
-@functools.cache
-def readers_of(module: str, name: str) -> Readers:
-    """Who reads a module's name."""
-    names = bound_as(module, name)
-    places, compiled, at_import = set[Place](), list[tuple[str, str]](), list[str]()
-    waiting = [(module, name)]
-    for origin in waiting:
-        bound = bound_as(*origin)
-        read: dict[str, set[str]] = {}
-        for where, local in bound:
-            read.setdefault(where, set()).add(local)
-        for other, it in loaded().items():
-            if origin[0] in it.modules:  # as an attribute of the module
-                read.setdefault(other, set()).add(origin[1])
-        for where, locals_ in read.items():
-            it = loaded()[where]
-            if origin == (module, name) and locals_ & it.at_import:
-                at_import.append(where)
-            for code in it.codes:
-                places |= lines_of(code, locals_)
-            for own, value in vars(it.module).items():
-                compiles = isinstance(value, Dispatcher) and value.py_func.__module__ == where
-                if compiles and lines_of(value.py_func.__code__, locals_):
-                    if (where, own) in compiled:
-                        compiled.remove((where, own))  # after what it calls
-                    compiled.append((where, own))
-                    waiting.append((where, own))
-    return Readers(tuple(names), frozenset(places), tuple(compiled), tuple(at_import))
-
-
-def shift(constant: Constant, value: Any) -> None:
-    """Give a constant another value in this process, for ever."""
-    readers = readers_of(constant.module, constant.name)
-    for where, local in readers.names:
-        mock.patch.object(loaded()[where].module, local, value).start()
-    for where, name in readers.compiled:
-        old: Any = vars(loaded()[where].module)[name]
-        new = numba.jit(**old.targetoptions)(old.py_func)
-        for other, local in bound_as(where, name):
-            mock.patch.object(loaded()[other].module, local, new).start()
-    forget_results()
-
-
-def forget_results() -> None:
-    """Empty the caches of functions: what is in them was computed from other values, or without reading any."""
-    for it in loaded().values():
-        for made in list(vars(it.module).values()):
-            if isinstance(made, functools._lru_cache_wrapper) and made.__module__ != __name__:
-                made.cache_clear()
-
-
 # --- Rules.
 
 
@@ -546,18 +251,6 @@ class Rule:
 
     name: str
     replaces: tuple[tuple[Any, str, Any], ...]
-
-    @property
-    def places(self) -> frozenset[Place]:
-        """The functions that are replaced; empty where a number is."""
-        found = set()
-        for owner, name, _ in self.replaces:
-            old = vars(owner)[name]
-            function = old.fget if isinstance(old, property) else old
-            if not callable(function):
-                return frozenset()
-            found.add(place_of(function.__code__))
-        return frozenset(found)
 
     def switch_off(self) -> None:
         """In this process, for ever."""
@@ -653,35 +346,25 @@ RULES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One change of the learner. ``of`` : what it belongs to. ``places`` : lines without which it does nothing."""
+    """One change of the learner: a rule without which it runs, or other settings. ``of`` : what it belongs to."""
 
     name: str
     of: str
-    kind: str
-    settings: Settings
-    begin: Callable[[], None]
-    places: frozenset[Place]
+    rule: Rule | None = None
+    settings: Settings = field(default_factory=dict)
     value: str = ""
-    impossible: str = ""
 
 
 #: Names of the factors.
 FACTORS: Final = {"half": 0.5, "twice": 2.0}
 
 
-def variants_of(constant: Constant) -> list[Variant]:
-    """Half and twice a constant."""
-    readers = readers_of(constant.module, constant.name)
-    found = []
-    for name, factor in FACTORS.items():
-        value = constant.shifted(factor)
-        begin = functools.partial(shift, constant, value)
-        why = f"read while {readers.at_import[0]} is imported" if readers.at_import else ""
-        found.append(
-            Variant(f"{constant.label} {name}", constant.label, "constant", {}, begin, readers.places,
-                    f"{constant.present}", why)
-        )  # fmt: skip
-    return found
+def scaled(value: float, factor: float) -> float:
+    """A number times a factor; an integer rounded, but moved by one at least."""
+    if not isinstance(value, int):
+        return value * factor
+    moved = round(value * factor)
+    return moved if moved != value or not value else value + (1 if factor > 1.0 else -1)
 
 
 def field_variants() -> list[Variant]:
@@ -698,100 +381,58 @@ def field_variants() -> list[Variant]:
             label = f"{table or 'learner'}.{entry.name}"
             for name, factor in FACTORS.items():
                 new = {entry.name: scaled(value, factor)}
-                settings = {table: new} if table else new
-                found.append(Variant(f"{label} {name}", label, "field", settings, _nothing, frozenset(), f"{value}"))
+                found.append(Variant(f"{label} {name}", label, None, {table: new} if table else new, f"{value}"))
     return found
 
 
 def rule_variants() -> list[Variant]:
     """Each rule switched off."""
-    return [Variant(rule.name, rule.name, "rule", {}, rule.switch_off, rule.places) for rule in RULES]
+    return [Variant(rule.name, rule.name, rule) for rule in RULES]
 
 
 # --- Running.
-
-
-def entered_in(call: Callable[[], Numbers], inside: Collection[str]) -> tuple[Numbers, frozenset[Place]]:
-    """The result of a call, and the lines that it has gone through: all lines of the files ``inside``, of other files
-    the first lines of functions."""
-    places = set[Place]()
-
-    def see_line(frame: FrameType, _: str, __: Any) -> Any:
-        places.add((frame.f_code.co_filename, frame.f_lineno))
-        return see_line
-
-    def see_call(frame: FrameType, _: str, __: Any) -> Any:
-        places.add(place_of(frame.f_code))
-        return see_line if frame.f_code.co_filename in inside else None
-
-    before = sys.gettrace()
-    sys.settrace(see_call)
-    try:
-        numbers = call()
-    finally:
-        sys.settrace(before)
-    return numbers, frozenset(places)
 
 
 #: A process may take this many times what the learner as it is takes, s of processor time at least.
 MOST_TIME, LEAST_S = 8.0, 60.0
 
 
-def _work(
-    cases: Sequence[Case], variant: Variant, noise: int, towards: Connection, most_s: float
-) -> None:  # pragma: no cover - in a process
+def _work(cases: Sequence[Case], variant: Variant, noise: int, most_s: float, towards: Connection) -> None:
     """Run cases in a process of its own; sends (name, numbers) as they end."""
     resource.setrlimit(resource.RLIMIT_CPU, (int(most_s), int(most_s) + 5))
-    begun = False
+    if variant.rule:
+        variant.rule.switch_off()
     for case in cases:
         try:
-            if not begun:
-                variant.begin()
-                begun = True
             numbers = case.run(noise, variant.settings)
         except Exception as error:
             numbers = {"failed": f"{type(error).__name__}: {error}"[:200]}
         towards.send((case.name, numbers))
-    towards.close()
-
-
-@dataclass(slots=True)
-class Job:
-    """A process that runs a variant."""
-
-    variant: Variant
-    noise: int
-    cases: Sequence[Case]
-    source: Connection
-    process: Any
-    numbers: dict[str, Numbers]
 
 
 def run_all(
-    plan: Sequence[tuple[Variant, int, Sequence[Case]]], jobs: int, seconds: float
+    plan: Sequence[tuple[Variant, int]], cases: Sequence[Case], jobs: int, most_s: float
 ) -> Iterator[tuple[Variant, int, dict[str, Numbers]]]:
-    """(variant, noise, numbers by case) as they end; each in a forked process. ``seconds``: of an ordinary one."""
-    context, running, waiting = multiprocessing.get_context("fork"), list[Job](), list(plan)
-    most_s = max(LEAST_S, MOST_TIME * seconds)
+    """(variant, noise, numbers by case) as they end; each in a forked process, which may take ``most_s``."""
+    context, waiting = multiprocessing.get_context("fork"), list(plan)
+    running: dict[Any, tuple[Variant, int, Any, dict[str, Numbers]]] = {}
     while waiting or running:
         while waiting and len(running) < jobs:
-            variant, noise, cases = waiting.pop(0)
+            variant, noise = waiting.pop(0)
             source, towards = context.Pipe(duplex=False)
-            process = context.Process(target=_work, args=(cases, variant, noise, towards, most_s))
+            process = context.Process(target=_work, args=(cases, variant, noise, most_s, towards))
             process.start()
             towards.close()
-            running.append(Job(variant, noise, cases, source, process, {}))
-        ready = wait([job.source for job in running])
-        for job in [job for job in running if job.source in ready]:
+            running[source] = (variant, noise, process, {})
+        for source in wait(list(running)):
+            variant, noise, process, numbers = running[source]
             try:
-                name, numbers = job.source.recv()
-                job.numbers[name] = numbers
+                numbers.update([source.recv()])
             except EOFError:
-                job.process.join()
-                running.remove(job)
-                for case in job.cases:
-                    job.numbers.setdefault(case.name, {"failed": f"the process ended: {job.process.exitcode}"})
-                yield job.variant, job.noise, job.numbers
+                process.join()
+                del running[source]
+                ended = {"failed": f"the process ended: {process.exitcode}"}
+                yield variant, noise, {case.name: numbers.get(case.name, ended) for case in cases}
 
 
 # --- Comparison.
@@ -912,17 +553,13 @@ HEAD = ("what", "value", "half / off", "twice", "better", "single cases that get
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The numbers of all variants so far, by name; the groups of cases; what was planned.
-
-    untested : variants whose lines no case goes through.
-    """
+    """The numbers of all variants so far, by name; the groups of cases; what was planned."""
 
     base: ByCase
     repeated: list[ByCase]
     groups: Mapping[str, Sequence[str]]
     variants: dict[str, ByCase]
     planned: Sequence[Variant]
-    untested: set[str] = field(default_factory=set)
 
     @property
     def comparisons(self) -> int:
@@ -946,14 +583,7 @@ class Results:
         return f"{rows} of {seen} rows and {cases} single cases"
 
 
-UNTESTED: Final = "no case goes there"
-
-
 def _told(results: Results, name: str) -> str:
-    if name not in results.variants:
-        return "not run"
-    if name in results.untested:
-        return UNTESTED
     rows, moved = results.worse(name), different(results.variants[name], results.base)
     if rows:
         return "**" + ", ".join(map(str, rows)) + "**"
@@ -967,32 +597,25 @@ def table(results: Results) -> str:
         groups.setdefault(variant.of, []).append(variant)
     parts: dict[str, list[tuple[str, ...]]] = {
         "changes nothing, to the last bit": [], "worth nothing: no row and no case gets worse beyond chance": [],
-        "open: single cases get worse, no row does": [], "worth its place": [], "not tested by these cases": [],
-        "not shifted": [],
+        "open: single cases get worse, no row does": [], "worth its place": [],
     }  # fmt: skip
     kinds = list(parts)
     for of, variants in groups.items():
-        first = variants[0]
-        done = [v for v in variants if v.name in results.variants]
-        if first.impossible:
-            parts[kinds[5]].append((of, first.value, first.impossible, "", "", ""))
+        names = [variant.name for variant in variants]
+        if not results.variants.keys() >= {*names}:
             continue
-        if len(done) < len(variants):
-            continue
-        cells = [_told(results, v.name) for v in variants]
-        shifts = {v.name: f"{v.name.removeprefix(of).strip()} " if len(variants) > 1 else "" for v in variants}
+        cells = [_told(results, name) for name in names]
+        shifts = {name: f"{name.removeprefix(of).strip()} ".lstrip() for name in names}
         better = [f"{shift}{row}" for name, shift in shifts.items() for row in results.worse(name, -1)]
         single = [f"{shift}{text}" for name, shift in shifts.items() for text in results.single(name)]
-        line = (of, first.value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single))
-        same = all(cell in ("the same", UNTESTED) for cell in cells)
-        worth = any(results.worse(v.name) for v in variants)
-        untested = all(cell == UNTESTED for cell in cells)
-        parts[kinds[4 if untested else 0 if same else 3 if worth else 2 if single else 1]].append(line)
+        line = (of, variants[0].value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single))
+        worth = any(results.worse(name) for name in names)
+        parts[kinds[0 if {*cells} == {"the same"} else 3 if worth else 2 if single else 1]].append(line)
     cases = sum(len(names) for names in results.groups.values())
     texts = [
         f"{cases} cases ({', '.join(f'{len(names)} {group}' for group, names in results.groups.items())}), "
-        f"{len(results.variants)} of {sum(not v.impossible for v in results.planned)} variants; other noise alone "
-        f"makes {results.by_chance()} worse by this rule"
+        f"{len(results.variants)} of {len(results.planned)} variants; other noise alone makes {results.by_chance()} "
+        "worse by this rule"
     ]
     for kind, lines in parts.items():
         if lines:
@@ -1017,30 +640,13 @@ def fingerprint(cases: Sequence[Case]) -> str:
 REPEATED: Final = 2
 
 
-def planned_variants(given: argparse.Namespace) -> list[Variant]:
-    """The variants that the arguments ask for. Exits where a name is unknown."""
-    rules, constants = rule_variants(), [v for c in all_constants() for v in variants_of(c)]
-    found = field_variants() if given.fields else []
-    for names, some in ((given.constants, constants), (given.rules, rules)):
-        if names is None:
-            continue
-        wanted = [name for name in names.split(",") if name]
-        for name in wanted:
-            if not any(name in variant.of for variant in some):
-                raise SystemExit(f"{name!r}: in the name of no rule or constant")
-        found += [variant for variant in some if not wanted or any(name in variant.of for name in wanted)]
-    return found or [*rules, *constants]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the variants, or print the table of a file."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.ablation", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    some = {"nargs": "?", "const": "", "metavar": "NAME[,NAME]"}
-    parser.add_argument("--constants", **some, help="only constants, with one of these in the name")
-    parser.add_argument("--rules", **some, help="only rules, with one of these in the name")
-    parser.add_argument("--fields", action="store_true", help="only the fields of the learner's configuration")
+    parser.add_argument("--rules", default="", metavar="NAME[,NAME]", help="only rules with one of these in the name")
+    parser.add_argument("--fields", action="store_true", help="the fields of the learner's configuration instead")
     parser.add_argument("--only", default="", metavar="CASE", help="cases with this in the name")
     parser.add_argument("--quick", action="store_true", help="fewer than half of the cases")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (1)")
@@ -1048,16 +654,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--table", type=Path, metavar="FILE", help="write the table here, again after each variant")
     given = parser.parse_args(arguments)
     if given.jobs < 1:
-        parser.error("--jobs: expected at least 1")
+        parser.error(f"--jobs: got {given.jobs}, expected at least 1")
+    planned = field_variants() if given.fields else rule_variants()
+    wanted = given.rules.split(",")
+    for name in wanted:
+        if not any(name in variant.of for variant in planned):
+            parser.error(f"--rules: got {name!r}, expected a part of a rule's name")
+    planned = [variant for variant in planned if any(name in variant.of for name in wanted)]
     begun = time.monotonic()
     cases = all_cases(given.quick, given.only)
     if not cases:
         parser.error(f"--only: got {given.only!r}, expected a part of a case's name")
     _say(f"{len(cases)} cases prepared in {time.monotonic() - begun:.0f} s")
-    text = table(ablate(cases, planned_variants(given), given.jobs, given.json, given.table))
-    if given.table:
-        given.table.write_text(text + "\n")
-    print(text)
+    print(table(ablate(cases, planned, given.jobs, given.json, given.table)))
     return 0
 
 
@@ -1066,56 +675,42 @@ def ablate(
 ) -> Results:
     """Run the learner as it is, its repetitions, and the variants that ``path`` does not hold yet.
 
-    ``to`` : file for the table, written anew after each variant. Exits where a case does not give the same twice.
+    ``to`` : file for the table, written anew after each variant. Exits where a case gives other numbers than before.
     """
     groups = {group: [case.name for case in cases if case.group == group] for group in GROUPS}
     groups = {group: names for group, names in groups.items() if names}
     mark = fingerprint(cases)
-    done, untested = read(path, mark)
-    # As it is, in this process, which loads all that is compiled; twice, to see what is called.
-    base, entered, seconds = dict[str, Numbers](), dict[str, frozenset[Place]](), dict[str, float]()
-    inside = {file for variant in planned for file, _ in variant.places}
+    done = read(path, mark)
+    # As it is, in this process, which loads all that is compiled.
+    base, begin = dict[str, Numbers](), time.process_time()
     for case in cases:
-        begin = time.process_time()
         base[case.name] = case.run(0, {})
-        seconds[case.name] = time.process_time() - begin
-        forget_results()
-        again, entered[case.name] = entered_in(functools.partial(case.run, 0, {}), inside)
-        if again != base[case.name]:
-            raise SystemExit(f"{case.name}: not deterministic: {base[case.name]}, then {again}")
-        _say(f"{case.name}: {', '.join(f'{name} {value:.3g}' for name, value in again.items())}")
+        _say(f"{case.name}: {', '.join(f'{name} {value:.3g}' for name, value in base[case.name].items())}")
+    seconds = time.process_time() - begin
     if UNMODIFIED not in done:
-        add(path, mark, UNMODIFIED, base, len(cases))
+        add_line(path, {"mark": mark, "variant": UNMODIFIED, "cases": base})
     elif changed := different(done[UNMODIFIED], base):
         raise SystemExit(f"{path}: {changed[0]} came to other numbers than now: another machine, or another build")
-    plan: list[tuple[Variant, int, Sequence[Case]]] = []
-    for k in range(1, REPEATED + 1):
-        plan.append((Variant(f"{NOISE} {k}", NOISE, "noise", {}, _nothing, frozenset()), k, cases))
-    for variant in planned:
-        if not variant.impossible:
-            # A variant whose lines are not gone through is the learner as it is.
-            plan.append((variant, 0, [c for c in cases if not variant.places or variant.places & entered[c.name]]))
+    noises = {f"{NOISE} {k}": k for k in range(1, REPEATED + 1)}
+    plan = [(Variant(name, NOISE), k) for name, k in noises.items()] + [(variant, 0) for variant in planned]
     plan = [entry for entry in plan if entry[0].name not in done]
     _say(f"{len(plan)} variants to run, {len(done)} results in the file")
-    repeated = [done[name] for k in range(1, REPEATED + 1) if (name := f"{NOISE} {k}") in done]
     known = {variant.name for variant in planned}
+    repeated = [numbers for name, numbers in done.items() if name in noises]
     results = Results(base, repeated, groups, {name: n for name, n in done.items() if name in known}, planned)
-    results.untested.update(untested)
-    planned_s = sum(seconds[case.name] for _, _, part in plan for case in part)
-    spent_s, begun = 0.0, time.monotonic()
-    for variant, noise, numbers in run_all(plan, jobs, sum(seconds.values())):
-        whole = {case.name: numbers.get(case.name, base[case.name]) for case in cases}
-        add(path, mark, variant.name, whole, len(numbers))
-        if not numbers:
-            results.untested.add(variant.name)
+    # What is kept in the caches of functions was computed with all rules.
+    for made in [made for made in gc.get_objects() if isinstance(made, functools._lru_cache_wrapper)]:
+        made.cache_clear()
+    begun = time.monotonic()
+    for k, (variant, noise, numbers) in enumerate(run_all(plan, cases, jobs, max(LEAST_S, MOST_TIME * seconds)), 1):
+        add_line(path, {"mark": mark, "variant": variant.name, "cases": numbers})
         if noise:
-            repeated.append(whole)
+            repeated.append(numbers)
         else:
-            results.variants[variant.name] = whole
-        spent_s += sum(seconds[name] for name in numbers)
-        left_s = (planned_s - spent_s) * (time.monotonic() - begun) / max(spent_s, 1e-9)
-        said = f"{len(different(whole, base))} cases differ" if noise else _told(results, variant.name)
-        _say(f"[{left_s / 60.0:.0f} min left] {variant.name} ({len(numbers)} cases run): {said}")
+            results.variants[variant.name] = numbers
+        left_s = (len(plan) - k) * (time.monotonic() - begun) / k
+        said = f"{len(different(numbers, base))} cases differ" if noise else _told(results, variant.name)
+        _say(f"[{left_s / 60.0:.0f} min left] {variant.name}: {said}")
         if to and repeated:
             to.write_text(table(results) + "\n")
     return results
@@ -1125,29 +720,10 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def read(path: Path | None, mark: str) -> tuple[dict[str, ByCase], set[str]]:
-    """The results in a file by variant, of the same learner and cases, and the variants for which no case was run."""
-    found, untested = dict[str, ByCase](), set[str]()
-    if path is None or not path.exists():
-        return found, untested
-    for line in path.read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:
-            continue  # cut off
-        if entry["mark"] == mark:
-            found[entry["variant"]] = entry["cases"]
-            if not entry["run"]:
-                untested.add(entry["variant"])
-    return found, untested
-
-
-def add(path: Path | None, mark: str, name: str, cases: ByCase, run: int) -> None:
-    """Add a line to a file. ``run`` : number of cases that were run; the others are as they are without the variant."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(json.dumps({"mark": mark, "variant": name, "run": run, "cases": cases}) + "\n")
+def read(path: Path | None, mark: str) -> dict[str, ByCase]:
+    """The results in a file by variant, of the same learner and cases."""
+    entries = read_lines([path]) if path and path.exists() else []
+    return {entry["variant"]: entry["cases"] for entry in entries if entry["mark"] == mark}
 
 
 if __name__ == "__main__":

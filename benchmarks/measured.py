@@ -143,6 +143,10 @@ def data_folder() -> Path:
     return Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
+#: Share of the range beyond the record's own at which the axis has its limits, so that none is reached.
+MARGIN = 0.25
+
+
 @dataclass(frozen=True, slots=True)
 class Cut:
     """(n,) voltages V and displacements µm, ``dt_s`` apart, of which the first ``split`` are for training.
@@ -174,6 +178,18 @@ class Cut:
         """The stretches without a jump of the time."""
         n = self.u_V.size
         return [slice(0, self.split), slice(self.split, n)] if self.jump else [slice(0, n)]
+
+    def whole(self) -> Stretch:
+        """All samples with the smoothed motion; each piece is smoothed for itself."""
+        smoother = LearnerConfig().smoother(self.dt_s)
+        motion = np.concatenate([smooth_recording(self.y_um[piece], smoother) for piece in self.pieces])
+        return Stretch(self.u_V, self.y_um, motion, np.ones(self.u_V.size, dtype=np.bool_))
+
+    def limits(self) -> Limits:
+        """Limits that the record does not reach."""
+        ends = [(x.min() - MARGIN * np.ptp(x), x.max() + MARGIN * np.ptp(x)) for x in (self.u_V, self.y_um)]
+        (u_low, u_high), (y_low, y_high) = ((float(low), float(high)) for low, high in ends)
+        return Limits(u_low, u_high, math.inf, y_low, y_high)
 
 
 # --- The yardstick: columns from the displacement, and least squares, once and recursively.
@@ -292,20 +308,24 @@ def replayed(
     return out
 
 
-def learnt(model: LssvmInverse, test: Stretch, dt_s: float, limits: Limits) -> FloatArray:
-    """(n,) voltages of the learner's snapshots, V."""
-    learner = Learner.from_model(model, learner_config({}, limits, "learner"))
+def learnt(
+    model: LssvmInverse, test: Stretch, dt_s: float, limits: Limits, settings: dict[str, Any] | None = None
+) -> tuple[FloatArray, list[str]]:
+    """(n,) voltages of the learner's snapshots, V, and verdicts. ``settings``: that differ from the defaults."""
+    learner = Learner.from_model(model, learner_config(settings or {}, limits, "learner"))
+    verdicts: list[str] = []
 
     def teach(part: slice) -> None:
         for k in range(part.start, part.stop):
-            learner.handle(Sample(k, k * dt_s, float(test.u_V[k]), float(test.y_um[k])))
+            verdicts.append(learner.handle(Sample(k, k * dt_s, float(test.u_V[k]), float(test.y_um[k]))))
 
     def newest() -> tuple[int, InverseModel, FloatArray] | None:
         snapshot = learner.snapshot()
         memory = learner.memory_for(snapshot)
         return None if memory is None else (learner.seq, snapshot, memory)
 
-    return replayed(test, dt_s, teach, newest, lambda _seq, at, memory, points: at.feedforward(*points, memory).u_V)
+    got = replayed(test, dt_s, teach, newest, lambda _seq, at, memory, points: at.feedforward(*points, memory).u_V)
+    return got, verdicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,8 +375,6 @@ def served(models: dict[str, InverseModel], test: Stretch, dt_s: float, limits: 
 
 #: Share of the test that is not scored. Length of the stretches of ``worst``, s, and least error of frozen there, %.
 SKIPPED, WORST_S, LEAST_PCT = 0.1, 2.0, 0.1
-#: Share of the range beyond the record's own at which the axis has its limits, so that none is reached.
-MARGIN = 0.25
 
 
 def rmse_pct(predicted_V: FloatArray, u_V: FloatArray, span_V: float) -> float:
@@ -380,8 +398,7 @@ def ratio(scores: dict[str, float], name: str) -> float:
 def measure(name: str, cut: Cut) -> dict[str, Any]:
     """All numbers of a record, JSON form. Raises InputError where its first part identifies no model."""
     begun, n, dt_s = time.monotonic(), cut.split, cut.dt_s
-    motion = np.concatenate([smooth_recording(cut.y_um[p], LearnerConfig().smoother(dt_s)) for p in cut.pieces])
-    whole = Stretch(cut.u_V, cut.y_um, motion, np.ones(cut.u_V.size, dtype=np.bool_))
+    whole, limits = cut.whole(), cut.limits()
     train, test = whole.part(0, n), whole.part(n, len(whole))
     models: dict[str, InverseModel] = {}
     failed = {}
@@ -396,12 +413,11 @@ def measure(name: str, cut: Cut) -> dict[str, Any]:
     assert isinstance(identified, LssvmInverse)
     before = None if cut.jump else train
     predicted = {("frozen" if m == LEARN else m): free_run(model, before, test) for m, model in models.items()}
-    limits = _around(cut)
     features = identified.features
     meta = BundleMeta("measured", "x", dt_s, y_min_um=features.y_min_um, y_max_um=features.y_max_um,
                       u_min_V=float(train.u_V.min()), u_max_V=float(train.u_V.max()))  # fmt: skip
     axis = served(models, test, dt_s, limits, meta)
-    predicted |= {"learner": learnt(identified, test, dt_s, limits), "served": axis.u_V}
+    predicted |= {"learner": learnt(identified, test, dt_s, limits)[0], "served": axis.u_V}
     simple, at = regressions(cut)
     scored: BoolArray = np.isfinite(axis.u_V[at]) & np.isfinite(predicted["learner"][at])
     scored &= at >= SKIPPED * len(test)
@@ -424,13 +440,6 @@ def measure(name: str, cut: Cut) -> dict[str, Any]:
         "failed": failed,
         "seconds": time.monotonic() - begun,
     }
-
-
-def _around(cut: Cut) -> Limits:
-    """Limits that the record does not reach."""
-    ends = [(x.min() - MARGIN * np.ptp(x), x.max() + MARGIN * np.ptp(x)) for x in (cut.u_V, cut.y_um)]
-    (u_low, u_high), (y_low, y_high) = ((float(low), float(high)) for low, high in ends)
-    return Limits(u_low, u_high, math.inf, y_low, y_high)
 
 
 # --- The table.

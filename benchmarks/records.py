@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 Record = dict[str, Any]
@@ -21,3 +24,33 @@ def recorded(record: Record) -> Iterator[None]:
     except Exception:
         record["failed"] = traceback.format_exc()
     record |= {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+
+
+def why_failed(record: Record) -> str:
+    """The last line of the traceback."""
+    return f"FAILED: {record['failed'].strip().splitlines()[-1]}"
+
+
+def read_lines(paths: Iterable[Path]) -> list[Record]:
+    """The records in files of JSON lines; an incomplete last line is left out."""
+    records = []
+    for path in paths:
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                records.append(json.loads(text))
+            except json.JSONDecodeError:
+                print(f"{path}: left out a line that is cut off", file=sys.stderr)
+    return records
+
+
+def add_line(path: Path | None, record: Record) -> None:
+    """Add a record to a file of JSON lines, if there is one, on a line of its own."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b") as file:
+        if file.tell():
+            file.seek(-1, 2)
+            if file.read(1) != b"\n":  # a line that was cut off
+                file.write(b"\n")
+        file.write(f"{json.dumps(record)}\n".encode())

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks import foreign
 from benchmarks.foreign_motions import HEAD, fits, planned, run_motion, table
+from benchmarks.records import read_lines
 from tests.foreign.plants import random_plant, with_traits
 
 
@@ -69,7 +70,7 @@ def test_runs_are_added_to_the_file_and_tabulated_with_it(tmp_path: Path, capsys
     ask = ["--motions", "raster:5", "--runs", "1", "--first-seed", "300000000", "--after", "4", "--poor"]
     assert foreign.main([*ask, "--json", str(file)]) == 0
     assert [row[0] for row in cells(capsys.readouterr().out)] == ["hold", "raster:5"]
-    records = foreign.read([file])
+    records = read_lines([file])
     assert len(records) == 2
     assert records[1]["recording"] == "poor"
     assert records[1]["frequency_Hz"] == 5.0
