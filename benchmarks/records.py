@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dehyst.service.storage.output import append_line
+
 Record = dict[str, Any]
 
 
@@ -44,13 +46,6 @@ def read_lines(paths: Iterable[Path]) -> list[Record]:
 
 
 def add_line(path: Path | None, record: Record) -> None:
-    """Add a record to a file of JSON lines, if there is one, on a line of its own."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as file:
-        if file.tell():
-            file.seek(-1, 2)
-            if file.read(1) != b"\n":  # a line that was cut off
-                file.write(b"\n")
-        file.write(f"{json.dumps(record)}\n".encode())
+    """Add a record to a file of JSON lines, if there is one."""
+    if path is not None:
+        append_line(path, json.dumps(record).encode() + b"\n")
