@@ -35,7 +35,11 @@ LABELS: Final = {
     "lssvm_adaptive": "LSSVM with memory",
 }
 NAMES: Final = tuple(LABELS)
-_FITS: Final = {"linear": fit_linear, "bouc_wen": fit_bouc_wen, "mpi": fit_mpi}
+_FITS: Final[dict[str, Callable[..., tuple[InverseModel, Any]]]] = {
+    "linear": fit_linear,
+    "bouc_wen": fit_bouc_wen,
+    "mpi": fit_mpi,
+}
 #: Inputs of the LSSVM models.
 _INPUTS: Final[dict[str, Literal["two", "memory"]]] = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
 #: Share at the beginning of a separate test recording that is not scored: it only settles the models' memory.
