@@ -59,6 +59,11 @@ def growing_triangles(
     corners_V = [0.0]
     for amplitude in amplitudes_V:
         corners_V += [amplitude, 0.0]
+    return _through(corners_V, rate_V_per_s, dt_s)
+
+
+def _through(corners_V: list[float], rate_V_per_s: float, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Straight lines from corner to corner at a constant rate."""
     corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
     t = sample_times(float(corners_s[-1]), dt_s)
     return t, np.interp(t, corners_s, corners_V)
@@ -81,37 +86,26 @@ def sine(
     return t, low_V + (high_V - low_V) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t))
 
 
-def minor_loops(
-    low_V: float = 1.0,
-    high_V: float = 7.0,
-    loops: int = 4,
-    inner_V: float = 1.5,
-    rate_V_per_s: float = 6.0,
-    dt_s: float = 1e-3,
-) -> tuple[FloatArray, FloatArray]:
-    """A large loop from 0 V with ``loops`` minor loops of depth ``inner_V`` on each branch."""
-    levels = np.linspace(low_V, high_V, loops + 2)[1:-1]
+def minor_loops(loops: int = 4, dt_s: float = 1e-3) -> tuple[FloatArray, FloatArray]:
+    """A large loop from 0 V through 1 to 7 V with ``loops`` minor loops of 1.5 V on each branch, at 6 V/s."""
+    low_V, high_V, inner_V = 1.0, 7.0, 1.5
+    levels = np.linspace(low_V, high_V, loops + 2)[1:-1].tolist()
     corners_V = [0.0, low_V]
     for level in levels:
-        corners_V += [float(level), float(level) - inner_V]
+        corners_V += [level, level - inner_V]
     corners_V.append(high_V)
     for level in levels[::-1]:
-        corners_V += [float(level), float(level) + inner_V]
-    corners_V += [low_V, 0.0]
-    corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
-    t = sample_times(float(corners_s[-1]), dt_s)
-    return t, np.interp(t, corners_s, corners_V)
+        corners_V += [level, level + inner_V]
+    return _through([*corners_V, low_V, 0.0], 6.0, dt_s)
 
 
-def multitone(
-    duration_s: float, dt_s: float = 1e-3, low_V: float = 0.5, high_V: float = 7.5, seed: int = 0, tones: int = 6
-) -> tuple[FloatArray, FloatArray]:
-    """A sum of sines between 0.5 and 20 Hz with amplitudes falling as 1/f, within the given voltages."""
+def multitone(duration_s: float, dt_s: float = 1e-3, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """A sum of six sines between 0.5 and 20 Hz with amplitudes falling as 1/f, within 0.5 to 7.5 V."""
     rng = np.random.default_rng(seed)
     t = sample_times(duration_s, dt_s)
-    frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), tones))
-    phase = rng.uniform(0.0, 2.0 * np.pi, tones)
+    frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), 6))
+    phase = rng.uniform(0.0, 2.0 * np.pi, 6)
     weight = 1.0 / frequency
     weight /= weight.sum()
     wave = np.sin(2.0 * np.pi * frequency * t[:, None] + phase) @ weight
-    return t, 0.5 * (low_V + high_V) + 0.5 * (high_V - low_V) * wave
+    return t, 4.0 + 3.5 * wave
