@@ -290,7 +290,7 @@ def replayed(
     is, and these (y, v, a); returns voltages.
     """
     block, age, n = max(1, round(BLOCK_S / dt_s)), max(1, round(AGE_S / dt_s)), len(test)
-    y, v, a = (np.ascontiguousarray(column) for column in test.motion.T)
+    y, v, a = test.columns
     out, past = np.full(n, np.nan), deque[tuple[int, int, InverseModel, FloatArray]]()
     for first in range(0, n, block):
         part = slice(first, min(n, first + block))
