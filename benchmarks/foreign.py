@@ -6,7 +6,7 @@ results, and one row for each class of events. Errors are mean absolute errors i
 file gets a line for each run as it ends; a further call goes on where it ends, and tabulates all that it holds.
 ``--table FILE`` prints the tables of finished runs. ``--line`` runs twelve fixed stages and prints one line.
 
-``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, with the learning loop alone, until
+``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens until
 the file holds that many hours of simulated time, and prints each trouble that was reported.
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks import foreign_motions
 from benchmarks.records import Record, add_line, read_lines, recorded, why_failed
-from dehyst.lab.rehearsal import RehearsalConfig, identify, run_event, run_healthy
+from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
 from dehyst.lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import MOTIONS, motion
@@ -55,6 +55,8 @@ LINE = (
 
 #: Class of healthy runs in the files. Length of such a run: as many samples as this, within these limits, s.
 HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
+#: From here on the errors of a healthy run count, s: what comes before is the start.
+HEALTHY_AT_S = 4.0
 
 #: What makes a record, and what names it: the record without results.
 Run = tuple[Callable[[], Record], Record]
@@ -79,15 +81,26 @@ def run_one(name: str, seed: int, after_s: float = AFTER_S, as_drawn: bool = Fal
 
 
 def run_healthy_stage(seed: int, block: int) -> Record:
-    """A run of the learning loop alone, in which nothing happens, as JSON values. If it raises, the record holds the
-    traceback."""
+    """A run in which nothing happens, as JSON values. If it raises, the record holds the traceback."""
     record: Record = {"seed": seed, "class": HEALTHY, "block": block}
     with recorded(record):
         factory = random_plant(seed)
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
-        config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block)
-        record |= run_healthy(factory, identify(factory, config), config, healthy_s(seed), seed).as_dict()
+        after_s = healthy_s(seed) - HEALTHY_AT_S
+        config = RehearsalConfig(
+            excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block, after_s=after_s
+        )
+        run = run_event(factory, identify(factory, config), config, Event("none", "none", HEALTHY_AT_S), seed)
+        course, out = run.adaptive, run.outcome.as_dict()
+        start, error_um = round(HEALTHY_AT_S / factory.traits.dt_s), np.abs(course.wanted_um - course.true_um)
+        record |= {
+            "simulated_s": out["simulated_s"],
+            "range_um": run.range_um,
+            "figures": out["adaptive"],
+            "mean_pct": 100.0 / run.range_um * float(error_um[start:].mean()),
+            "troubles": [one | {"named_s": one["named_s"] + HEALTHY_AT_S} for one in out["troubles"]],
+        }
     return record
 
 
@@ -109,7 +122,7 @@ def motion_runs(given: argparse.Namespace) -> list[Run]:
     recording = foreign_motions.RECORDINGS[given.poor]
     return [
         (
-            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after, given.true_length),
+            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after),
             {"seed": seed, "recording": recording, "motion": name},
         )
         for name, seed in foreign_motions.planned(given.motions, given.first_seed, given.runs)
@@ -438,9 +451,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"({foreign_motions.AFTER_S:g})",
     )  # fmt: skip
     parser.add_argument("--poor", action="store_true", help="--motions: identify from 2 s of half the stroke")
-    parser.add_argument(
-        "--true-length", action="store_true", help="--motions: hold for an hour, stand for a night; takes hours"
-    )
     parser.add_argument(
         "--block", type=int, default=5, metavar="N",
         help="samples per query and snapshot of --healthy (5): fewer queries cost less, and answers are older",

@@ -143,10 +143,6 @@ def data_folder() -> Path:
     return Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
-#: Share of the range beyond the record's own at which the axis has its limits, so that none is reached.
-MARGIN = 0.25
-
-
 @dataclass(frozen=True, slots=True)
 class Cut:
     """(n,) voltages V and displacements µm, ``dt_s`` apart, of which the first ``split`` are for training.
@@ -179,12 +175,14 @@ class Cut:
         n = self.u_V.size
         return [slice(0, self.split), slice(self.split, n)] if self.jump else [slice(0, n)]
 
+    @property
     def whole(self) -> Stretch:
-        """All samples with the smoothed motion; each piece is smoothed for itself."""
+        """Both parts with their smoothed motion."""
         smoother = LearnerConfig().smoother(self.dt_s)
         motion = np.concatenate([smooth_recording(self.y_um[piece], smoother) for piece in self.pieces])
         return Stretch(self.u_V, self.y_um, motion, np.ones(self.u_V.size, dtype=np.bool_))
 
+    @property
     def limits(self) -> Limits:
         """Limits that the record does not reach."""
         ends = [(x.min() - MARGIN * np.ptp(x), x.max() + MARGIN * np.ptp(x)) for x in (self.u_V, self.y_um)]
@@ -290,7 +288,7 @@ def replayed(
     is, and these (y, v, a); returns voltages.
     """
     block, age, n = max(1, round(BLOCK_S / dt_s)), max(1, round(AGE_S / dt_s)), len(test)
-    y, v, a = test.columns
+    y, v, a = (np.ascontiguousarray(column) for column in test.motion.T)
     out, past = np.full(n, np.nan), deque[tuple[int, int, InverseModel, FloatArray]]()
     for first in range(0, n, block):
         part = slice(first, min(n, first + block))
@@ -311,7 +309,7 @@ def replayed(
 def learnt(
     model: LssvmInverse, test: Stretch, dt_s: float, limits: Limits, settings: dict[str, Any] | None = None
 ) -> tuple[FloatArray, list[str]]:
-    """(n,) voltages of the learner's snapshots, V, and verdicts. ``settings``: that differ from the defaults."""
+    """(n,) voltages of the snapshots of a learner with these settings, V, and its verdicts on the samples."""
     learner = Learner.from_model(model, learner_config(settings or {}, limits, "learner"))
     verdicts: list[str] = []
 
@@ -375,6 +373,8 @@ def served(models: dict[str, InverseModel], test: Stretch, dt_s: float, limits: 
 
 #: Share of the test that is not scored. Length of the stretches of ``worst``, s, and least error of frozen there, %.
 SKIPPED, WORST_S, LEAST_PCT = 0.1, 2.0, 0.1
+#: Share of the range beyond the record's own at which the axis has its limits, so that none is reached.
+MARGIN = 0.25
 
 
 def rmse_pct(predicted_V: FloatArray, u_V: FloatArray, span_V: float) -> float:
@@ -398,7 +398,7 @@ def ratio(scores: dict[str, float], name: str) -> float:
 def measure(name: str, cut: Cut) -> dict[str, Any]:
     """All numbers of a record, JSON form. Raises InputError where its first part identifies no model."""
     begun, n, dt_s = time.monotonic(), cut.split, cut.dt_s
-    whole, limits = cut.whole(), cut.limits()
+    whole = cut.whole
     train, test = whole.part(0, n), whole.part(n, len(whole))
     models: dict[str, InverseModel] = {}
     failed = {}
@@ -413,6 +413,7 @@ def measure(name: str, cut: Cut) -> dict[str, Any]:
     assert isinstance(identified, LssvmInverse)
     before = None if cut.jump else train
     predicted = {("frozen" if m == LEARN else m): free_run(model, before, test) for m, model in models.items()}
+    limits = cut.limits
     features = identified.features
     meta = BundleMeta("measured", "x", dt_s, y_min_um=features.y_min_um, y_max_um=features.y_max_um,
                       u_min_V=float(train.u_V.min()), u_max_V=float(train.u_V.max()))  # fmt: skip

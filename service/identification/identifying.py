@@ -26,22 +26,10 @@ from dehyst.sim.recordings import Recording, Repaired
 
 # --- Identification and scores.
 
-#: The models in the order in which they are identified and shown: names in the legends.
-LABELS: Final = {
-    "linear": "linear gain",
-    "bouc_wen": "Bouc-Wen",
-    "mpi": "modified Prandtl-Ishlinskii",
-    "lssvm_frozen": "LSSVM, two inputs",
-    "lssvm_adaptive": "LSSVM with memory",
-}
-NAMES: Final = tuple(LABELS)
-_FITS: Final[dict[str, Callable[..., tuple[InverseModel, Any]]]] = {
-    "linear": fit_linear,
-    "bouc_wen": fit_bouc_wen,
-    "mpi": fit_mpi,
-}
-#: Inputs of the LSSVM models.
-_INPUTS: Final[dict[str, Literal["two", "memory"]]] = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
+#: Names of the models, in the order in which they are identified and shown.
+NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
+#: How the baselines are fitted.
+_FITS: Final[dict[str, Callable[..., Any]]] = {"linear": fit_linear, "bouc_wen": fit_bouc_wen, "mpi": fit_mpi}
 #: Share at the beginning of a separate test recording that is not scored: it only settles the models' memory.
 SETTLE_SHARE = 0.05
 #: Fewest samples for identification, and for scoring.
@@ -108,12 +96,6 @@ class Stretch:
     def part(self, start: int, stop: int) -> Stretch:
         return Stretch(self.u_V[start:stop], self.y_um[start:stop], self.motion[start:stop], self.valid[start:stop])
 
-    @property
-    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n,) displacements µm, velocities µm/s and accelerations µm/s²."""
-        y, v, a = np.ascontiguousarray(self.motion.T)
-        return y, v, a
-
     def __len__(self) -> int:
         return len(self.u_V)
 
@@ -178,13 +160,16 @@ def identify_one(
     ``most`` : samples that enter a fit; a longer recording is thinned. Raises what its identification
     raises: InputError on data, NumericsError on arithmetic.
     """
+    part = _fitted_part(name, len(u_V), dt_s, most)
+    u_thin, y_thin, dt_thin = u_V[part], y_um[part], dt_s * part.step
     if name in _FITS:
-        part = _fitted_part(name, len(u_V), dt_s, most)
-        return _FITS[name](u_V[part], y_um[part], dt_s * part.step, serve_dt_s=dt_s)[0]
-    if name not in _INPUTS:
+        model: InverseModel = _FITS[name](u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
+        return model
+    if name not in NAMES:
         raise FieldError("models", repr(name), f"some of {', '.join(NAMES)}")
     config = IdentifyConfig(n=max(10, min(n, len(u_V) // 2)), rows=max(100, most))
-    return identify_lssvm(u_V, y_um, dt_s, inputs=_INPUTS[name], config=config, name=name)[0]
+    inputs: Literal["two", "memory"] = "two" if name == "lssvm_frozen" else "memory"
+    return identify_lssvm(u_V, y_um, dt_s, inputs=inputs, config=config, name=name)[0]
 
 
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
@@ -193,11 +178,18 @@ def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> Floa
     ``before`` : the samples just before the test; they only settle the memory. Without them, the memory starts as that
     of a stage at rest at the first test sample.
     """
-    settling = before if before is not None and len(before) else None
-    memory = model.rest_memory(float((settling or test).motion[0, 0]))
-    if settling is not None:
-        memory = model.track(*settling.columns, settling.u_V, memory)
-    return model.feedforward(*test.columns, memory).u_V
+    first = before if before is not None and len(before) else test
+    memory = model.rest_memory(float(first.motion[0, 0]))
+    if before is not None and len(before):
+        y, v, a = _columns(before)
+        memory = model.track(y, v, a, before.u_V, memory)
+    y, v, a = _columns(test)
+    return model.feedforward(y, v, a, memory).u_V
+
+
+def _columns(stretch: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    y, v, a = (np.ascontiguousarray(stretch.motion[:, i]) for i in range(3))
+    return y, v, a
 
 
 def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Score:
@@ -242,12 +234,13 @@ def identify_all(
     before = train if follows else test.part(0, settle)
     scored = test.part(settle, len(test))
     results: list[Identified] = []
-    phases = list(_PHASES)[: 2 if whole is None else 3]
-    work = {(name, phase): _WEIGHTS[name] * _PHASES[phase] for name in names for phase in phases}
+    phases = ("fit", "score") if whole is None else ("fit", "score", "fit again from all")
+    work = [(name, phase) for name in names for phase in phases]
+    total = sum(_WEIGHTS[name] * _PHASES[phase] for name, phase in work)
 
     def begin(name: str, phase: str) -> None:
-        done = list(work).index((name, phase))
-        progress(name, phase, sum(list(work.values())[:done]) / sum(work.values()))
+        before = work[: work.index((name, phase))]
+        progress(name, phase, sum(_WEIGHTS[done] * _PHASES[part] for done, part in before) / total)
 
     for name in names:
         start = time.perf_counter()
@@ -275,6 +268,15 @@ def identify_all(
 
 
 # --- The picture of an identification: measured loop, remaining loop, held-out residual and errors of all models.
+
+#: Names of the models in the legends.
+LABELS = {
+    "linear": "linear gain",
+    "bouc_wen": "Bouc-Wen",
+    "mpi": "modified Prandtl-Ishlinskii",
+    "lssvm_frozen": "LSSVM, two inputs",
+    "lssvm_adaptive": "LSSVM with memory",
+}
 
 
 def draw_identification(

@@ -22,7 +22,7 @@ from dehyst.sim.signals.references import Reference, blend_step, demo_reference
 from dehyst.sim.signals.voltages import sample_times
 from dehyst.sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
 from dehyst.sim.stage.config import StageConfig
-from dehyst.sim.stage.stage import Stage
+from dehyst.sim.stage.stage import Stage, StageState
 
 # --- Control and replay with a model that learns while it serves, in one process and without a clock.
 #
@@ -52,16 +52,18 @@ def track_learning(
     online: OnlineModel,
     *,
     pid: PID | None = None,
+    state: StageState | None = None,
     config: BlockConfig | None = None,
 ) -> Run:
-    """Follow ``reference`` from rest with the feedforward of a model that learns; ``online`` is advanced.
+    """Follow ``reference`` with the feedforward of a model that learns; ``online`` and ``state`` are advanced.
 
-    The memory starts at rest at 0 µm and is passed from block to block. Limits and the integral of the feedback are
-    handled as in ``sim.stage.closed_loop.track``.
+    Without ``state`` the stage starts at rest. The memory starts at rest at 0 µm and is passed from block to block.
+    Limits and the integral of the feedback are handled as in ``sim.stage.closed_loop.track``.
     """
     config = config or BlockConfig()
-    state = stage.initial_state()
+    state = state or stage.initial_state()
     n, dt_s = reference.y_um.size, stage.config.dt_s
+    first = state.k
     low, high = stage.config.u_min_V, stage.config.u_max_V
     y, u, forward, feedback = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
     snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
@@ -86,9 +88,10 @@ def track_learning(
                 fed.limit(wanted, float(u[k]))
                 stage.step(state, float(u[k]))
         for k in range(part.start, part.stop):
-            online.handle(Sample(k, k * dt_s, float(u[k]), float(y[k])))
+            online.handle(Sample(first + k, (first + k) * dt_s, float(u[k]), float(y[k])))
         snapshots.append(online.snapshot())
-    return Run(np.arange(n, dtype=np.float64) * dt_s, reference.y_um, y, u, forward, feedback)
+    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
+    return Run(t_s, reference.y_um, y, u, forward, feedback)
 
 
 def replay(
@@ -128,49 +131,40 @@ def replay(
 
 #: Step of the central differences that give velocity and acceleration of a formula, s.
 _STEP_S = 1e-4
-#: Length of the chapter's sweeps, s.
-_SWEEP_S = 10.0
 #: Top of the references as a share of the motion range, so that they stay within the identified range.
 _TOP = 0.9
 
 
-def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float) -> Reference:
+def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float, dt_s: float = DT_S) -> Reference:
     """Reference of a smooth formula y(t), µm; derivatives by central differences with 0.1 ms steps."""
-    t = sample_times(duration_s, DT_S)
+    t = sample_times(duration_s, dt_s)
     now, before, after = formula(t), formula(t - _STEP_S), formula(t + _STEP_S)
     return Reference(t, now, (after - before) / (2.0 * _STEP_S), (after - 2.0 * now + before) / _STEP_S**2)
 
 
-def chapter_reference(range_um: float) -> Reference:
+def chapter_reference(range_um: float, duration_s: float = 10.0) -> Reference:
     """(2.45) in displacement: its decaying sweep scaled to 90 % of the motion range."""
     scale = _TOP * range_um / 2.0
-
-    def formula(t: FloatArray) -> FloatArray:
-        wave = np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - np.pi) + 1.0
-        return np.asarray(scale * np.exp(-0.14 * t) * wave, dtype=np.float64)
-
-    return from_formula(formula, _SWEEP_S)
+    return from_formula(
+        lambda t: scale * np.exp(-0.14 * t) * (np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - np.pi) + 1.0), duration_s
+    )
 
 
-def training_reference(range_um: float) -> Reference:
+def training_reference(range_um: float, duration_s: float = 10.0) -> Reference:
     """(2.37) in displacement, scaled to 90 % of the range: the motion of the training record."""
     scale = _TOP * range_um / 2.0
-
-    def formula(t: FloatArray) -> FloatArray:
-        wave = np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 0.5 * np.pi) + 1.0
-        return np.asarray(scale * np.exp(-0.11 * t) * wave, dtype=np.float64)
-
-    return from_formula(formula, _SWEEP_S)
+    return from_formula(
+        lambda t: scale * np.exp(-0.11 * t) * (np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 0.5 * np.pi) + 1.0),
+        duration_s,
+    )
 
 
 def sine_reference(range_um: float, frequency_Hz: float = 5.0, duration_s: float = 4.0) -> Reference:
     """A sine from 0 to 80 % of the range, whose amplitude rises smoothly over the first half second."""
-
-    def formula(t: FloatArray) -> FloatArray:
-        size = blend_step(np.clip(t / 0.5, 0.0, 1.0))[0]
-        return np.asarray(0.4 * range_um * size * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t)), dtype=np.float64)
-
-    return from_formula(formula, duration_s)
+    omega = 2.0 * np.pi * frequency_Hz
+    return from_formula(
+        lambda t: 0.4 * range_um * blend_step(np.clip(t / 0.5, 0.0, 1.0))[0] * (1.0 - np.cos(omega * t)), duration_s
+    )
 
 
 def answered_reference(record: Record) -> Reference:
@@ -299,11 +293,11 @@ def learner_of(model: InverseModel) -> OnlineModel:
     return online
 
 
-def changing(config: StageConfig, at_s: float) -> StageConfig:
-    """The stage with a relative change of the gain by `GAIN_CHANGE` at ``at_s``, s."""
+def changing(config: StageConfig, at_s: float, gain: float = GAIN_CHANGE) -> StageConfig:
+    """The stage with a relative change of the gain by ``gain`` at ``at_s``, s."""
     if "gain_drift" not in config.effects:
         config = replace(config, effects=config.effects + effect("gain_drift", ramp_per_min=0.0))
-    return replace(config, changes=((at_s, {"gain_drift.gain": GAIN_CHANGE}),))
+    return replace(config, changes=((at_s, {"gain_drift.gain": gain}),))
 
 
 def run_control(
@@ -368,9 +362,9 @@ def _changed(
     return tuple(loops)
 
 
-def moving_mae(error_um: FloatArray, range_um: float) -> FloatArray:
-    """(n,) MAE over the last half second, percent of ``range_um``; fewer samples at the start."""
-    n = round(0.5 / DT_S)
+def moving_mae(error_um: FloatArray, range_um: float, span_s: float = 0.5) -> FloatArray:
+    """(n,) MAE over the last ``span_s``, percent of ``range_um``; fewer samples at the start."""
+    n = max(1, round(span_s / DT_S))
     total = np.concatenate([[0.0], np.cumsum(np.abs(error_um))])
     at = np.arange(1, error_um.size + 1)
     since = np.maximum(at - n, 0)

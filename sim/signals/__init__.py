@@ -1,1 +1,1 @@
-"""Signals for simulated stages: ``voltages`` to apply, ``references`` to follow, and ``sample_times``."""
+"""Signals for simulated stages: ``voltages`` to apply, ``references`` to follow."""

@@ -56,14 +56,11 @@ def growing_triangles(
     """Triangles from 0 V of growing amplitude at a constant rate, as in Fig. 2.2. Raises InputError on bad values."""
     if not amplitudes_V or min(amplitudes_V) <= 0.0 or rate_V_per_s <= 0.0:
         raise InputError(f"amplitudes_V, rate_V_per_s: got {amplitudes_V}, {rate_V_per_s}, expected positive numbers")
-    corners_V = [0.0]
-    for amplitude in amplitudes_V:
-        corners_V += [amplitude, 0.0]
-    return _through(corners_V, rate_V_per_s, dt_s)
+    return _straight([0.0, *(corner for amplitude in amplitudes_V for corner in (amplitude, 0.0))], rate_V_per_s, dt_s)
 
 
-def _through(corners_V: list[float], rate_V_per_s: float, dt_s: float) -> tuple[FloatArray, FloatArray]:
-    """Straight lines from corner to corner at a constant rate."""
+def _straight(corners_V: list[float], rate_V_per_s: float, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Straight from corner to corner at one rate."""
     corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
     t = sample_times(float(corners_s[-1]), dt_s)
     return t, np.interp(t, corners_s, corners_V)
@@ -87,25 +84,23 @@ def sine(
 
 
 def minor_loops(loops: int = 4, dt_s: float = 1e-3) -> tuple[FloatArray, FloatArray]:
-    """A large loop from 0 V through 1 to 7 V with ``loops`` minor loops of 1.5 V on each branch, at 6 V/s."""
+    """A large loop from 0 V, between 1 and 7 V, with ``loops`` minor loops of 1.5 V on each branch, at 6 V/s."""
     low_V, high_V, inner_V = 1.0, 7.0, 1.5
     levels = np.linspace(low_V, high_V, loops + 2)[1:-1].tolist()
-    corners_V = [0.0, low_V]
-    for level in levels:
-        corners_V += [level, level - inner_V]
-    corners_V.append(high_V)
-    for level in levels[::-1]:
-        corners_V += [level, level + inner_V]
-    return _through([*corners_V, low_V, 0.0], 6.0, dt_s)
+    up = [corner for level in levels for corner in (level, level - inner_V)]
+    down = [corner for level in levels[::-1] for corner in (level, level + inner_V)]
+    return _straight([0.0, low_V, *up, high_V, *down, low_V, 0.0], 6.0, dt_s)
 
 
-def multitone(duration_s: float, dt_s: float = 1e-3, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-    """A sum of six sines between 0.5 and 20 Hz with amplitudes falling as 1/f, within 0.5 to 7.5 V."""
+def multitone(
+    duration_s: float, dt_s: float = 1e-3, low_V: float = 0.5, high_V: float = 7.5, seed: int = 0, tones: int = 6
+) -> tuple[FloatArray, FloatArray]:
+    """A sum of sines between 0.5 and 20 Hz with amplitudes falling as 1/f, within the given voltages."""
     rng = np.random.default_rng(seed)
     t = sample_times(duration_s, dt_s)
-    frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), 6))
-    phase = rng.uniform(0.0, 2.0 * np.pi, 6)
+    frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), tones))
+    phase = rng.uniform(0.0, 2.0 * np.pi, tones)
     weight = 1.0 / frequency
     weight /= weight.sum()
     wave = np.sin(2.0 * np.pi * frequency * t[:, None] + phase) @ weight
-    return t, 4.0 + 3.5 * wave
+    return t, 0.5 * (low_V + high_V) + 0.5 * (high_V - low_V) * wave

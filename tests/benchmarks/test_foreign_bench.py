@@ -105,17 +105,17 @@ def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
 
 
 def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foreign, "HEALTHY_S", (6.0, 6.0))
+    monkeypatch.setattr(foreign, "HEALTHY_S", (8.0, 8.0))
     file = tmp_path / "healthy.jsonl"
     file.write_text(json.dumps(healthy_run(900_001, simulated_s=10.0)) + "\n{cut off")
-    hours = 14.0 / 3600.0
+    hours = 16.0 / 3600.0
     assert main(["--healthy", f"{hours}", "--first-seed", "900001", "--json", str(file), "--block", "20"]) == 0
     records = read_lines([file])
     assert [record["seed"] for record in records] == [900_001, 900_002]
     new = records[1]
     assert new["class"] == "healthy"
     assert new["block"] == 20
-    assert new["simulated_s"] == pytest.approx(6.0, abs=0.05)
+    assert new["simulated_s"] == pytest.approx(8.0, abs=0.05)
     assert new["mean_pct"] < 1.0
     assert "frozen" not in new
     # The hours are reached: nothing is run.
