@@ -21,17 +21,7 @@ from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from dehyst.baselines.bouc_wen.identify import fit_bouc_wen as fit_bouc_wen
-    from dehyst.baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
-    from dehyst.baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
-    from dehyst.baselines.common import FitReport as FitReport
-    from dehyst.baselines.competition.champion import ChampionInverse as ChampionInverse
-    from dehyst.baselines.competition.competition import Competition as Competition
-    from dehyst.baselines.competition.config import CompetitionConfig as CompetitionConfig
-    from dehyst.baselines.linear import LinearInverse as LinearInverse
-    from dehyst.baselines.linear import LinearOnline as LinearOnline
     from dehyst.baselines.linear import fit_linear as fit_linear
     from dehyst.baselines.prandtl_ishlinskii.identify import fit_mpi as fit_mpi
-    from dehyst.baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
-    from dehyst.baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
 __getattr__ = lazy_names(__name__)

@@ -1,19 +1,16 @@
 """How the service does on stages that it was not built for: stages, events and times drawn at random, in lockstep.
 
 ``python -m benchmarks.foreign --runs 500 --jobs 2 --json out/foreign.jsonl`` draws a stage, an event and its time for
-each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), writes one line per run, and prints two
-tables: the goals with the results, and one row for each class of events. ``--table FILE`` prints the tables of
-finished runs. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute errors in percent of
-the commanded range.
+each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), and prints two tables: the goals with the
+results, and one row for each class of events. Errors are mean absolute errors in percent of the commanded range. The
+file gets a line for each run as it ends; a further call goes on where it ends, and tabulates all that it holds.
+``--table FILE`` prints the tables of finished runs. ``--line`` runs twelve fixed stages and prints one line.
 
-``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, until the file holds that
-many hours of simulated time, and prints each trouble that was reported. Further calls go on where the file ends.
+``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens until
+the file holds that many hours of simulated time, and prints each trouble that was reported.
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
-on stages on which nothing happens, and adds to the file.
-
-``--controllers 1 5 20 --runs 10`` runs the corrections beside other controllers, with readings so many samples old
-(``lab.rehearsal.controllers``), and prints medians and worst ones. A stage takes a minute or two.
+on stages on which nothing happens.
 """
 
 from __future__ import annotations
@@ -21,33 +18,29 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import json
 import multiprocessing
 import os
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import foreign_motions
-from benchmarks.records import Record, recorded
+from benchmarks.records import Record, add_line, read_lines, recorded, why_failed
+from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
 from dehyst.lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import MOTIONS, motion
+from tests.foreign.plants import random_plant
 
-PRESETS = ("random", "issue", "as_drawn")
-#: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.
-SETTLE_S, LATER_S = {"random": 4.0, "issue": 9.0, "as_drawn": 4.0}, 1.5
+#: The event comes so long after the start of the closed loop, s, and up to so much later.
+SETTLE_S, LATER_S = 4.0, 1.5
 #: Closed loop after the event, s.
 AFTER_S = 5.0
-#: Share of the tones in the reference for the preset "issue", whose stages follow tones alone.
-ISSUE_TONES = 0.45
 #: Limits: time of motion within which a sensor fault must be named, s; time above 5 % of the range, s.
 NAMED_S, LARGE_S = 0.5, 0.1
 #: Step of the gain that the goal refers to, percent.
@@ -64,33 +57,24 @@ LINE = (
 HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
 #: From here on the errors of a healthy run count, s: what comes before is the start.
 HEALTHY_AT_S = 4.0
-#: Healthy runs end when so many have failed.
-MOST_FAILED = 10
 
-#: What makes a record, and the record without results if its process dies.
+#: What makes a record, and what names it: the record without results.
 Run = tuple[Callable[[], Record], Record]
 
 
-def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
-    """One run with an event of the class ``name``, as JSON values. If it raises, the record holds the traceback."""
-    from dehyst.lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
-    from tests.foreign.plants import issue_plant, random_plant
+def run_one(name: str, seed: int, after_s: float = AFTER_S, as_drawn: bool = False) -> Record:
+    """One run with an event of the class ``name``, as JSON values. If it raises, the record holds the traceback.
 
-    begin_cpu = time.process_time()
-    record: Record = {"seed": seed, "preset": preset, "class": name}
+    as_drawn : also such stages as move against their voltage after a turn, as no piezo does.
+    """
+    record: Record = {"seed": seed, "class": name}
     with recorded(record):
-        factory = issue_plant(seed) if preset == "issue" else random_plant(seed, as_drawn=preset == "as_drawn")
-        at_s = SETTLE_S[preset] + float(np.random.default_rng([seed, 22]).uniform(0.0, LATER_S))
+        factory = random_plant(seed, as_drawn=as_drawn)
+        at_s = SETTLE_S + float(np.random.default_rng([seed, 22]).uniform(0.0, LATER_S))
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
-        config = RehearsalConfig(
-            excite_low_V=low_V,
-            excite_high_V=high_V,
-            after_s=after_s,
-            reference=(lambda wish: RandomReference(wish, ISSUE_TONES)) if preset == "issue" else None,
-        )
+        config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, after_s=after_s)
         known = identify(factory, config)
-        record["identify_s"] = time.process_time() - begin_cpu
         run = run_event(factory, known, config, draw(name, seed, at_s), seed)
         record |= run.outcome.as_dict() | {"range_um": run.range_um, "heldout_mae_pct": known.heldout_mae_pct}
     return record
@@ -98,133 +82,80 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
 
 def run_healthy_stage(seed: int, block: int) -> Record:
     """A run in which nothing happens, as JSON values. If it raises, the record holds the traceback."""
-    from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
-    from tests.foreign.plants import random_plant
-
     record: Record = {"seed": seed, "class": HEALTHY, "block": block}
     with recorded(record):
         factory = random_plant(seed)
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
-        after_s = float(np.clip(HEALTHY_SAMPLES * factory.traits.dt_s, *HEALTHY_S)) - HEALTHY_AT_S
+        after_s = healthy_s(seed) - HEALTHY_AT_S
         config = RehearsalConfig(
             excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block, after_s=after_s
         )
         run = run_event(factory, identify(factory, config), config, Event("none", "none", HEALTHY_AT_S), seed)
         course, out = run.adaptive, run.outcome.as_dict()
-        start, course_um = round(HEALTHY_AT_S / factory.traits.dt_s), np.abs(course.wanted_um - course.true_um)
+        start, error_um = round(HEALTHY_AT_S / factory.traits.dt_s), np.abs(course.wanted_um - course.true_um)
         record |= {
             "simulated_s": out["simulated_s"],
             "range_um": run.range_um,
             "figures": out["adaptive"],
-            "mean_pct": 100.0 / run.range_um * float(course_um[start:].mean()),
+            "mean_pct": 100.0 / run.range_um * float(error_um[start:].mean()),
             "troubles": [one | {"named_s": one["named_s"] + HEALTHY_AT_S} for one in out["troubles"]],
         }
     return record
 
 
-def run_controllers(seed: int, ages: Sequence[int]) -> Record:
-    """All controllers on a stage, as JSON values. If it raises, the record holds the traceback."""
-    from benchmarks.correction import course_of
-    from dehyst.lab.rehearsal import controllers
-
-    record: Record = {"seed": seed, "ages": list(ages)}
-    with recorded(record):
-        course = course_of(seed)
-        found = controllers.compare(course.make, course.known, course.low_V, course.mode_Hz, ages, seed)
-        record |= {"hysteresis": course.name, "controllers": [asdict(one) for one in found]}
-    return record
+def healthy_s(seed: int) -> float:
+    """Length of a healthy run, s."""
+    return float(np.clip(HEALTHY_SAMPLES * random_plant(seed).traits.dt_s, *HEALTHY_S))
 
 
-def controllers_table(records: Sequence[Record]) -> str:
-    """Median and worst of all stages, by controller and age."""
-    from dehyst.lab.rehearsal.controllers import HEAD, WAYS
+# ---- plans
 
-    by_row: dict[tuple[str, int], list[list[float]]] = {}
-    for record in records:
-        for one in record.get("controllers", ()):
-            errors = [one["moving_pct"], one["first_second_pct"], *one["lines_pct"]]
-            by_row.setdefault((one["way"], one["age"]), []).append(errors)
-    rows = [
+
+def event_runs(plan: Iterable[tuple[str, int]], after_s: float = AFTER_S) -> list[Run]:
+    """The runs of (class, seed)."""
+    return [(functools.partial(run_one, name, seed, after_s), {"seed": seed, "class": name}) for name, seed in plan]
+
+
+def motion_runs(given: argparse.Namespace) -> list[Run]:
+    """The runs of ``--motions``."""
+    recording = foreign_motions.RECORDINGS[given.poor]
+    return [
         (
-            WAYS[way], str(age),
-            *(f"{np.median(column):.3f} / {max(column):.3f}" if np.isfinite(column).all() else "-"
-              for column in zip(*errors, strict=True)),
+            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after),
+            {"seed": seed, "recording": recording, "motion": name},
         )
-        for (way, age), errors in by_row.items()
-    ]  # fmt: skip
-    stages = sum("controllers" in record for record in records)
-    return f"{stages} stages, median / worst, % of the range:\n\n{markdown(HEAD, rows)}"
+        for name, seed in foreign_motions.planned(given.motions, given.first_seed, given.runs)
+    ]
 
 
-def told_controllers(record: Record) -> str:
-    """The controllers of a stage in one line."""
-    if "failed" in record:
-        return told(record)
-    return f"seed {record['seed']} {record['hysteresis']}: {len(record['controllers'])} rows, {record['cpu_s']:.0f} s"
+def healthy_runs(hours: float, first_seed: int, block: int, kept: Sequence[Record]) -> list[Run]:
+    """Runs of seeds that are not kept, until all that have not failed are ``hours`` long."""
+    found, known, planned_h = list[Run](), {record["seed"] for record in kept}, _hours(kept)
+    seeds = (seed for seed in itertools.count(first_seed) if seed not in known)
+    while planned_h < hours:
+        seed = next(seeds)
+        planned_h += healthy_s(seed) / 3600.0
+        named: Record = {"seed": seed, "class": HEALTHY, "block": block}
+        found.append((functools.partial(run_healthy_stage, seed, block), named))
+    return found
 
 
 def run_all(plan: Sequence[Run], jobs: int) -> Iterator[Record]:
     """The runs of ``plan`` in the order in which they end. If a process dies, its run has failed."""
-    _one_blas_thread()
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     if jobs == 1:
         for run, _ in plan:
             yield run()
         return
-    with _pool(jobs) as pool:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         waiting = {pool.submit(run): lost for run, lost in plan}
         for done in as_completed(waiting):
             try:
                 yield done.result()
             except BrokenProcessPool:
                 yield waiting[done] | {"failed": "the process ended"}
-
-
-def event_runs(plan: Iterable[tuple[str, int]], preset: str = "random", after_s: float = AFTER_S) -> list[Run]:
-    """The runs of (class, seed)."""
-    return [
-        (functools.partial(run_one, name, seed, preset, after_s), {"seed": seed, "preset": preset, "class": name})
-        for name, seed in plan
-    ]
-
-
-def run_healthy_hours(
-    hours: float, first_seed: int, jobs: int, block: int, done: Sequence[Record] = ()
-) -> Iterator[Record]:
-    """Healthy runs of the seeds from ``first_seed`` on that are not in ``done``, in the order in which they end, until
-    all together, with ``done``, are at least ``hours`` of simulated time, or ``MOST_FAILED`` have failed."""
-    _one_blas_thread()
-    known = {record["seed"] for record in done}
-    seeds = (seed for seed in itertools.count(first_seed) if seed not in known)
-    simulated_h, failed = _hours(done), 0
-    with _pool(jobs) as pool:
-        running: dict[Future[Record], int] = {}
-        while True:
-            # How long a run will be is not known before; so all processes work until the hours are reached.
-            while simulated_h < hours and failed < MOST_FAILED and len(running) < jobs:
-                seed = next(seeds)
-                running[pool.submit(run_healthy_stage, seed, block)] = seed
-            if not running:
-                return
-            for ended in wait(running, return_when=FIRST_COMPLETED).done:
-                seed = running.pop(ended)
-                try:
-                    record = ended.result()
-                except BrokenProcessPool:
-                    yield {"seed": seed, "class": HEALTHY, "block": block, "failed": "the process ended"}
-                    return
-                simulated_h += _hours([record])
-                failed += "failed" in record
-                yield record
-
-
-def _pool(jobs: int) -> Executor:
-    return ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
-
-
-def _one_blas_thread() -> None:
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def _hours(records: Iterable[Record]) -> float:
@@ -346,7 +277,6 @@ def goals(records: Sequence[Record]) -> str:
             "0 in 8 h",
             f"{false} in {hours:.2f} h of simulated time",
         ),
-        ("cost of a sample", "≤ 1.1 × before", "not measured by these runs"),
     ]
     return markdown(GOALS_HEAD, rows)
 
@@ -415,7 +345,7 @@ def line(records: Sequence[Record]) -> str:
     done = [*intact, *sensors]
     failed = len(records) - len(done)
     settled = _percentiles(_of(intact, "adaptive", "settled_pct"), 50)
-    told = [
+    parts = [
         f"{len(records)} runs",
         *([f"{failed} FAILED"] if failed else []),
         f"{sum(map(_at_rail, done))} at a rail",
@@ -423,7 +353,9 @@ def line(records: Sequence[Record]) -> str:
         f"{_count(sensors, _named)} sensor faults named, {_count(sensors, _in_order)} within the error allowed",
         f"settled {settled} % (median)",
     ]
-    return "foreign stages: " + ", ".join(told)
+    return "\n".join(
+        [*(told(record) for record in records if "failed" in record), "foreign stages: " + ", ".join(parts)]
+    )
 
 
 HEALTHY_HEAD = (
@@ -454,7 +386,7 @@ def healthy_table(records: Sequence[Record]) -> str:
         )
     names = Counter(trouble["name"] for record in records for trouble in record.get("troubles", ()))
     total = ", ".join(f"{name} {count}" for name, count in sorted(names.items())) or "none"
-    notable = [told_healthy(record) for record in sorted(records, key=lambda r: int(r["seed"])) if _notable(record)]
+    notable = [told(record) for record in sorted(records, key=lambda r: int(r["seed"])) if _notable(record)]
     blocks = ", ".join(str(block) for block in sorted({record["block"] for record in records}))
     return "\n".join(
         [
@@ -474,71 +406,31 @@ def _notable(record: Record) -> bool:
     return "failed" in record or bool(record["troubles"]) or record["figures"]["large_s"] > LARGE_S
 
 
-def told_healthy(record: Record) -> str:
-    """A healthy run in one line."""
-    if "failed" in record:
-        return f"seed {record['seed']}: FAILED: {record['failed'].strip().splitlines()[-1]}"
-    figures, stage = record["figures"], record["stage"]
-    marks = [
-        *(f"TROUBLE {t['name']} at {t['named_s']:.2f} s" for t in record["troubles"]),
-        *([f"LARGE for {figures['large_s']:.2f} s"] if figures["large_s"] > LARGE_S else []),
-    ]
-    return (
-        f"seed {record['seed']} {stage['hysteresis']} {_rate_Hz(record)} Hz, {record['simulated_s']:.0f} s: "
-        f"error {record['mean_pct']:.3f}, {record['cpu_s']:.1f} s {', '.join(marks)}".rstrip()
-    )
-
-
 def told(record: Record) -> str:
     """A run in one line."""
+    first = f"seed {record['seed']} "
     if "failed" in record:
-        return f"seed {record['seed']} {record.get('class', '')}: FAILED: {record['failed'].strip().splitlines()[-1]}"
-    adaptive, stage = record["adaptive"], record["stage"]
-    marks = [
-        *(["AT A RAIL"] if _at_rail(record) else []),
-        *([f"LARGE for {adaptive['large_s']:.2f} s from {adaptive['large_at_s']:+.2f} s"] if _large(record) else []),
-        *(["NOT NAMED"] if record["category"] == SENSOR and not _named(record) else []),
-    ]
-    return (
-        f"seed {record['seed']} {stage['hysteresis']} {1.0 / stage['dt_s']:.0f} Hz, {record['text']}: "
-        f"first {adaptive['first_second_pct']:.3f}, settled {adaptive['settled_pct']:.3f}, "
-        f"{record['cpu_s']:.1f} s {' '.join(marks)}".rstrip()
-    )
+        return f"{first}{record.get('class', record.get('motion', ''))}: {why_failed(record)}"
+    first += f"{record['stage']['hysteresis']} {_rate_Hz(record)} Hz, "
+    if "motion" in record:
+        first += foreign_motions.told(record)
+        marks = [f"TROUBLE {trouble['name']} at {trouble['at_s']:.2f} s" for trouble in record["troubles"]]
+    elif record["class"] == HEALTHY:
+        first += f"{record['simulated_s']:.0f} s: error {record['mean_pct']:.3f}"
+        large_s = record["figures"]["large_s"]
+        marks = [f"TROUBLE {trouble['name']} at {trouble['named_s']:.2f} s" for trouble in record["troubles"]]
+        marks += [f"LARGE for {large_s:.2f} s"] if large_s > LARGE_S else []
+    else:
+        adaptive = record["adaptive"]
+        first += f"{record['text']}: first {adaptive['first_second_pct']:.3f}, settled {adaptive['settled_pct']:.3f}"
+        large = f"LARGE for {adaptive['large_s']:.2f} s from {adaptive['large_at_s'] or 0.0:+.2f} s"
+        unnamed = record["category"] == SENSOR and not _named(record)
+        seen = {"AT A RAIL": _at_rail(record), large: _large(record), "NOT NAMED": unnamed}
+        marks = [mark for mark, holds in seen.items() if holds]
+    return f"{first}, {record['cpu_s']:.1f} s {', '.join(marks)}".rstrip()
 
 
 # ---- command line
-
-
-def read(paths: Iterable[Path]) -> list[Record]:
-    """The runs in files; an incomplete last line is left out."""
-    records = []
-    for path in paths:
-        for text in path.read_text().splitlines():
-            try:
-                records.append(json.loads(text))
-            except json.JSONDecodeError:
-                print(f"{path}: left out a line that is cut off", file=sys.stderr)
-    return records
-
-
-def run_line(jobs: int) -> list[Record]:
-    """The runs of ``LINE``, with their progress on stderr."""
-    print(
-        f"{len(LINE)} runs on simulated stages that the service was not built with, about half a minute ...",
-        file=sys.stderr,
-        flush=True,
-    )
-    records = []
-    for record in run_all(event_runs(LINE), jobs):
-        records.append(record)
-        if sys.stderr.isatty():
-            print(f"\r{len(records)} of {len(LINE)}", end="", file=sys.stderr, flush=True)
-    if sys.stderr.isatty():
-        print("\r\033[K", end="", file=sys.stderr, flush=True)
-    for record in records:
-        if "failed" in record:
-            print(told(record), file=sys.stderr)
-    return records
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -547,14 +439,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=40, metavar="N", help="how many seeds (40)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="S", help="the first of them (0)")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (1; 2 with --line)")
-    parser.add_argument("--json", type=Path, metavar="F", help="write a line of JSON for each run, as it ends")
+    parser.add_argument(
+        "--json", type=Path, metavar="F", help="add a line for each run, as it ends; go on where the file ends"
+    )
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="EVENT", help=f"classes of events: {', '.join(CLASSES)}"
     )
-    parser.add_argument(
-        "--preset", choices=PRESETS, default="random",
-        help="which stages (random); as_drawn: also such as move against their voltage after a turn, as no piezo does",
-    )  # fmt: skip
     parser.add_argument(
         "--after", type=float, metavar="S",
         help=f"closed loop after the event, s ({AFTER_S:g}), or from {foreign_motions.FROM_S:g} s of a motion on "
@@ -568,16 +458,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     only = parser.add_mutually_exclusive_group()
     only.add_argument(
         "--healthy", type=float, metavar="HOURS",
-        help="run stages on which nothing happens until --json holds so many hours of simulated time; it is continued",
+        help="run stages on which nothing happens until --json holds so many hours of simulated time",
     )  # fmt: skip
     only.add_argument(
         "--motions", metavar="NAME[,NAME]",
         help=f"run motions on stages on which nothing happens: {', '.join(MOTIONS)}; raster:10 is one of 10 Hz",
     )  # fmt: skip
-    only.add_argument(
-        "--controllers", nargs="+", type=int, metavar="AGE",
-        help="run the corrections beside other controllers, with readings so many samples old",
-    )  # fmt: skip
+    only.add_argument("--controllers", nargs="*", help=argparse.SUPPRESS)
     only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
     only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
     given = parser.parse_args(arguments)
@@ -586,118 +473,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jobs = given.jobs if given.jobs is not None else 2 if given.line else 1
     if given.runs < 1 or jobs < 1 or given.first_seed < 0:
         parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
-    if any(age < 1 for age in given.controllers or ()):
-        parser.error(f"--controllers: got {min(given.controllers)}, expected ages of 1 sample or more")
-    names = given.motions.split(",") if given.motions is not None else []
-    for name in names:
+    if given.controllers is not None:
+        parser.error("--controllers: gone; call python -m benchmarks.correction --first SEED --stages N")
+    given.motions = given.motions.split(",") if given.motions is not None else []
+    for name in given.motions:
         try:
             motion(name)
         except (KeyError, ValueError):
             parser.error(f"--motions: got {name!r}, expected some of {', '.join(MOTIONS)}, or such as raster:10")
     if given.after is None:
-        given.after = foreign_motions.AFTER_S if names else AFTER_S
+        given.after = foreign_motions.AFTER_S if given.motions else AFTER_S
     if given.after < 4.0:
         parser.error(f"--after: got {given.after:g} s, expected 4 s or more")
-    if given.healthy is not None:
-        if not 0.0 < given.healthy <= 1e4:
-            parser.error(f"--healthy: got {given.healthy:g}, expected hours above 0 and up to 10000")
-        if not 1 <= given.block <= 512:
-            parser.error(f"--block: got {given.block}, expected 1 to 512")
-    records, told_of = _carry_out(given, names, jobs)
-    print(told_of)
+    if given.healthy is not None and not 0.0 < given.healthy <= 1e4:
+        parser.error(f"--healthy: got {given.healthy:g}, expected hours above 0 and up to 10000")
+    if not 1 <= given.block <= 512:
+        parser.error(f"--block: got {given.block}, expected 1 to 512")
+    records = read_lines(given.table) if given.table else _carry_out(given, jobs)
+    print(line(records) if given.line else tables(records))
     return 1 if any("failed" in record for record in records) else 0
 
 
-def _carry_out(given: argparse.Namespace, names: Sequence[str], jobs: int) -> tuple[list[Record], str]:
-    """The runs that are asked for, or those of the files, and their tables. ``names`` : of motions."""
-    if given.healthy is not None:
-        records = _run_healthy(given, jobs)
-        return records, healthy_table(records)
-    if names:
-        records = _run_motions(given, names, jobs)
-        return records, foreign_motions.table(records)
-    if given.controllers:
-        seeds = range(given.first_seed, given.first_seed + given.runs)
-        plan = [(functools.partial(run_controllers, seed, given.controllers), {"seed": seed}) for seed in seeds]
-        records = _run_plan(plan, jobs, given.json, told_controllers)
-        return records, controllers_table(records)
+def tables(records: Sequence[Record]) -> str:
+    """The tables of all kinds of runs among the records."""
+    parts: dict[Callable[[Sequence[Record]], str], list[Record]] = {
+        table: [],
+        healthy_table: [],
+        foreign_motions.table: [],
+    }
+    for record in records:
+        healthy = record.get("class") == HEALTHY
+        parts[foreign_motions.table if "motion" in record else healthy_table if healthy else table].append(record)
+    return "\n\n".join(made(part) for made, part in parts.items() if part) or table([])
+
+
+def _carry_out(given: argparse.Namespace, jobs: int) -> list[Record]:
+    """The runs that are asked for, after those that the file holds already."""
     if given.line:
-        records = run_line(jobs)
-        return records, line(records)
-    if not given.table:
-        records = _run(given, jobs)
-        return records, table(records)
-    records = read(given.table)
-    motions = [record for record in records if "motion" in record]
-    compared = [record for record in records if "ages" in record]
-    named = [record for record in records if "class" in record and "motion" not in record]
-    healthy = [record for record in named if record["class"] == HEALTHY]
-    others = [record for record in named if record["class"] != HEALTHY]
-    parts = (
-        (table, others), (healthy_table, healthy), (foreign_motions.table, motions), (controllers_table, compared),
-    )  # fmt: skip
-    return records, "\n\n".join(made(part) for made, part in parts if part) or table([])
-
-
-def _run(given: argparse.Namespace, jobs: int) -> list[Record]:
-    classes = given.only or list(CLASSES)
-    seeds = range(given.first_seed, given.first_seed + given.runs)
-    if given.json:
-        given.json.parent.mkdir(parents=True, exist_ok=True)
-        given.json.write_text("")
-    plan = event_runs([(classes[seed % len(classes)], seed) for seed in seeds], given.preset, given.after)
-    return _run_plan(plan, jobs, given.json, told)
-
-
-def _run_motions(given: argparse.Namespace, names: Sequence[str], jobs: int) -> list[Record]:
-    """The runs of the file so far, and the new ones."""
-    records = _continued(given.json, lambda record: "motion" in record)
-    recording = foreign_motions.RECORDINGS[given.poor]
-    plan = [
-        (
-            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after),
-            {"seed": seed, "recording": recording, "motion": name},
+        print(
+            f"{len(LINE)} runs on simulated stages that the service was not built with, half a minute", file=sys.stderr
         )
-        for name, seed in foreign_motions.planned(names, given.first_seed, given.runs)
-    ]
-    return [*records, *_run_plan(plan, jobs, given.json, foreign_motions.told)]
-
-
-def _run_plan(plan: Sequence[Run], jobs: int, path: Path | None, told: Callable[[Record], str]) -> list[Record]:
-    records = []
-    for record in run_all(plan, jobs):
+        return list(run_all(event_runs(LINE), jobs))
+    records = read_lines([given.json]) if given.json and given.json.exists() else []
+    if given.healthy is not None:
+        plan = healthy_runs(given.healthy, given.first_seed, given.block, records)
+    elif given.motions:
+        plan = motion_runs(given)
+    else:
+        seeds = range(given.first_seed, given.first_seed + given.runs)
+        classes = given.only or list(CLASSES)
+        plan = event_runs([(classes[seed % len(classes)], seed) for seed in seeds], given.after)
+    plan = [(run, named) for run, named in plan if not any(named.items() <= record.items() for record in records)]
+    for k, record in enumerate(run_all(plan, jobs), 1):
         records.append(record)
-        print(f"[{len(records)}/{len(plan)}] {told(record)}", file=sys.stderr, flush=True)
-        _add(path, record)
-    return records
-
-
-def _add(path: Path | None, record: Record) -> None:
-    if path:
-        with path.open("a") as file:
-            file.write(json.dumps(record) + "\n")
-
-
-def _continued(path: Path | None, holds: Callable[[Record], bool]) -> list[Record]:
-    """Those runs of a file for which ``holds``; the file is ready for more."""
-    if not path:
-        return []
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not path.exists():
-        return []
-    if (text := path.read_text()) and not text.endswith("\n"):
-        path.write_text(f"{text}\n")  # after a line that was cut off
-    return [record for record in read([path]) if holds(record)]
-
-
-def _run_healthy(given: argparse.Namespace, jobs: int) -> list[Record]:
-    records = _continued(given.json, lambda record: record.get("class") == HEALTHY)
-    if records:
-        print(f"{given.json}: {len(records)} runs, {_hours(records):.2f} h", file=sys.stderr)
-    for record in run_healthy_hours(given.healthy, given.first_seed, jobs, given.block, records):
-        records.append(record)
-        print(f"[{_hours(records):.2f} of {given.healthy:g} h] {told_healthy(record)}", file=sys.stderr, flush=True)
-        _add(given.json, record)
+        print(f"[{k}/{len(plan)}] {told(record)}", file=sys.stderr, flush=True)
+        add_line(given.json, record)
     return records
 
 

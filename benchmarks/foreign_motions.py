@@ -16,6 +16,8 @@ from typing import Final
 import numpy as np
 
 from benchmarks.records import Record, recorded
+from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
+from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.protocol.query import BLENDED, OUTSIDE_DOMAIN, STAND_IN
 from dehyst.service.reports.tables import json_form, markdown
 from tests.foreign.motions import MOTIONS, motion
@@ -84,9 +86,6 @@ def _fitting(name: str, first_seed: int) -> Iterator[int]:
 
 def run_motion(name: str, seed: int, recording: str = "full", after_s: float = AFTER_S) -> Record:
     """One motion on one stage, learning and frozen, as JSON values. If it raises, the record holds the traceback."""
-    from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
-    from dehyst.lab.rehearsal.outcome import moving_mean
-
     record: Record = {"seed": seed, "recording": recording, "motion": name}
     with recorded(record):
         factory = random_plant(seed)
@@ -213,13 +212,8 @@ def table(records: Sequence[Record]) -> str:
 
 
 def told(record: Record) -> str:
-    """A run in one line."""
-    if "failed" in record:
-        return f"seed {record['seed']} {record['motion']}: FAILED: {record['failed'].strip().splitlines()[-1]}"
-    marks = [f"TROUBLE {trouble['name']} at {trouble['at_s']:.2f} s" for trouble in record["troubles"]]
+    """What a run came to, in words."""
     return (
-        f"seed {record['seed']} {record['stage']['hysteresis']} {1.0 / record['stage']['dt_s']:.0f} Hz, "
         f"{record['motion']} {record['frequency_Hz']:.3g} Hz: {record['adaptive_pct']:.3f}, "
-        f"frozen {record['frozen_pct']:.3f}, two seconds {record['two_seconds']:.2f}, "
-        f"{record['cpu_s']:.1f} s {', '.join(marks)}".rstrip()
+        f"frozen {record['frozen_pct']:.3f}, two seconds {record['two_seconds']:.2f}"
     )

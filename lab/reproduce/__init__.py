@@ -3,8 +3,3 @@
 `study.run_study` computes everything, `tables.tables` turns it into ``tables.json``, and `report.write_study` writes
 the report, the tables and the figures.
 """
-
-from dehyst.lab.reproduce.measured import Study, StudyConfig, run_study
-from dehyst.lab.reproduce.report import tables, write_study
-
-__all__ = ["Study", "StudyConfig", "run_study", "tables", "write_study"]

@@ -185,10 +185,9 @@ class Watcher:
     from any. Close it before the interpreter ends.
     """
 
-    def __init__(self, axis: Axis, config: WatchConfig, name: str = "") -> None:
+    def __init__(self, axis: Axis, config: WatchConfig) -> None:
         self.config = config
         self._axis = axis
-        self._name = name or axis.config.name
         self._dt_s = axis.dt_s
         self._buffer = SampleBuffer(self._samples(config.history_s))
         self._alarm = Alarm(config, _span_V(axis))
@@ -254,7 +253,7 @@ class Watcher:
         if self._reference is None:
             return {"started": False, "why": f"no reference yet: {have_s:.0f} of {self.config.reference_s:g} s seen"}
         first = self._buffer.last_seq - self._samples(float(recent_s)) + 1
-        out = f"{self.config.reports}/{self._name}-{time.strftime('%Y%m%d-%H%M%S')}" if report else ""
+        out = f"{self.config.reports}/{self._axis.config.name}-{time.strftime('%Y%m%d-%H%M%S')}" if report else ""
         return self._start("request", "", first, time.monotonic(), out)
 
     def status(self) -> dict[str, Any]:

@@ -35,14 +35,13 @@ class CommandBuffer:
     its command sets ``first``.
     """
 
-    def __init__(self, size: int = AHEAD, begin: int = 0) -> None:
-        self.size = size
+    def __init__(self, begin: int = 0) -> None:
         self.begin = begin
         self.counts = {"blocks": 0, "voltages": 0, "late": 0, "missing": 0, "refused": 0}
         self.first = threading.Event()
         self.error = ""
-        self._values = np.zeros(size)
-        self._numbers = np.full(size, -1, dtype=np.int64)
+        self._values = np.zeros(AHEAD)
+        self._numbers = np.full(AHEAD, -1, dtype=np.int64)
         self._next = begin
         self._last_V = 0.0
         self._came = threading.Event()
@@ -63,14 +62,14 @@ class CommandBuffer:
         Raises FieldError if the block ends beyond the ring.
         """
         now = self._next
-        if block.seq + len(block) > now + self.size:
-            raise FieldError("seq", block.seq + len(block) - 1, f"at most {now + self.size - 1}, the ring's end")
+        if block.seq + len(block) > now + AHEAD:
+            raise FieldError("seq", block.seq + len(block) - 1, f"at most {now + AHEAD - 1}, the ring's end")
         self.counts["blocks"] += 1
         self.counts["voltages"] += len(block)
         numbers = np.arange(block.seq, block.seq + len(block))
         fresh = numbers >= now
         self.counts["late"] += int(len(numbers) - np.count_nonzero(fresh))
-        slots = numbers[fresh] % self.size
+        slots = numbers[fresh] % AHEAD
         self._values[slots] = block.values[fresh]
         self._numbers[slots] = numbers[fresh]
         self._came.set()
@@ -87,7 +86,7 @@ class CommandBuffer:
         No longer from ``until_s`` (``time.perf_counter``) on; nor again before the next command, or before the first.
         """
         self._came.clear()
-        if self._numbers.item(k % self.size) == k or self.counts["blocks"] == self._given_up:
+        if self._numbers.item(k % AHEAD) == k or self.counts["blocks"] == self._given_up:
             return False
         if time.perf_counter() >= until_s:
             self._given_up = self.counts["blocks"]
@@ -98,7 +97,7 @@ class CommandBuffer:
     def take(self, k: int) -> float:
         """The voltage for tick k, V; if none came in time the last one, counted as missing."""
         self._next = k + 1
-        slot = k % self.size
+        slot = k % AHEAD
         if self._numbers.item(slot) == k:
             self._last_V = self._values.item(slot)
         elif self.counts["blocks"]:

@@ -21,16 +21,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dehyst.service.background.job import BackgroundJob
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.storage.owner import FolderOwner
 from dehyst.service.storage.segments import (
     LOCK,
     RECORD,
-    Closer,
     Journal,
     Rows,
     Syncer,
     close_left_open,
+    closed_by,
+    closing,
     journal_of,
     left_open,
     make_room,
@@ -127,7 +129,7 @@ class Recorder:
         self._segment: Journal | None = None
         # Whether there may be journals to close, and the number of the first one that is of this recorder.
         self._left_open, self._first = True, sys.maxsize
-        self._closer: Closer | None = None
+        self._closer: BackgroundJob | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
         self._not_before = self._told_until = self._look_at = 0.0
@@ -305,17 +307,13 @@ class Recorder:
         closer = self._closer
         if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
             self._left_open = False
-            try:
-                self._closer = Closer(self.config.directory, self._segment.path)
-            except OSError as error:
-                self._left_open = True
-                self._failed(error)
+            self._closer = closing(self.config.directory, self._segment.path)
         elif closer is not None and not closer.running:
             self._closer = None
-            self._take_result(closer.result)
+            self._take_result(lambda: closed_by(closer))
 
     def _take_result(self, closed: Callable[[], list[Path]]) -> None:
-        """``closed`` : closes segments, or waits until they are; returns them."""
+        """``closed`` : returns the segments that were closed; raises OSError."""
         try:
             made = closed()
             own = sum(number_of(path) >= self._first for path in made)
@@ -329,7 +327,7 @@ class Recorder:
     def _close_all(self) -> None:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
         if self._closer is not None:
-            self._closer.kill()
+            self._closer.cancel()
         if not left_open(self.config.directory):
             return
 

@@ -5,16 +5,14 @@ therefore a journal. Closing it writes a Parquet file under a temporary name, sy
 the newest closed segment stays until the next segment is closed: a restart learns the samples after its checkpoint from
 it.
 
-``python -m dehyst.service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it
-as a process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service;
-at its end it closes them itself.
+The recorder has segments closed by a `BackgroundJob`, which runs this module: the conversion needs memory and the
+interpreter's lock, which would delay the service. At its end the recorder closes them itself.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -27,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.service.background.job import step_back
+from dehyst.service.background.job import BackgroundJob, run_worker
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.storage.output import PART, atomic_write
-from dehyst.service.storage.owner import FolderOwner, is_still_at, owner_of
+from dehyst.service.storage.owner import is_still_at, owner_of
 
 # --- The journal of a recording: samples appended as rows of fixed size, readable up to the last row after any crash.
 #
@@ -222,8 +220,8 @@ LOCK: Final = ".lock"
 DONE: Final = ".done"
 #: Prefix of the names of journals: readers that take the folder as one data set, such as pyarrow, skip such files.
 HIDDEN: Final = "_"
-#: Command-line argument for "no journal is being written".
-_NONE: Final = "-"
+#: Longest time that the process which closes segments may take, s.
+_CLOSING_S: Final = 3600.0
 
 
 def schema() -> Any:
@@ -271,40 +269,27 @@ def close_left_open(directory: Path, but: Path | None = None) -> list[Path]:
     return made
 
 
-class Closer:
-    """`close_left_open` in a process of its own. Raises OSError if the process cannot be started."""
+def closing(directory: Path, but: Path) -> BackgroundJob:
+    """`close_left_open` in a process of its own; see `closed_by` for its result."""
+    order = {"directory": str(directory), "but": str(but)}
+    job = BackgroundJob("dehyst.service.storage.segments", order, {}, _CLOSING_S)
+    job.start()
+    return job
 
-    def __init__(self, directory: Path, but: Path | None) -> None:
-        root = Path(__file__).resolve().parents[2]
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "dehyst.service.storage.segments", str(directory), str(but or _NONE)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-            # Ctrl-C must end the service only, which then waits for this process.
-            start_new_session=True,
-        )
 
-    @property
-    def running(self) -> bool:
-        """Whether the process still runs."""
-        return self._process.poll() is None
+def closed_by(job: BackgroundJob) -> list[Path]:
+    """The new segments of a job that has ended. Raises OSError with its message if it failed."""
+    result = job.result or {}
+    if "error" in result:
+        raise OSError(f"closing a segment: {result['error']}")
+    return [Path(path) for path in result.get("closed", ())]
 
-    def kill(self) -> None:
-        """End the process: what it has not closed stays open."""
-        self._process.kill()
-        self._process.communicate()
 
-    def result(self) -> list[Path]:
-        """Wait for the process; returns the new segments. Raises OSError with its message if it failed."""
-        out, err = self._process.communicate()
-        if self._process.returncode:
-            words = err.strip().splitlines() or [f"ended with status {self._process.returncode}"]
-            raise OSError(f"closing a segment: {words[-1]}")
-        return [Path(line) for line in out.splitlines()]
+def _close(order: dict[str, Any], _: object) -> dict[str, Any]:
+    try:
+        return {"closed": [str(path) for path in close_left_open(Path(order["directory"]), Path(order["but"]))]}
+    except OSError as error:
+        return {"error": error.strerror or str(error)}
 
 
 def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
@@ -388,26 +373,5 @@ def _sorted(directory: Path, suffix: str) -> list[Path]:
     return sorted((p for p in directory.glob(f"*segment-*{suffix}") if number_of(p) >= 0), key=number_of)
 
 
-def main() -> int:
-    """Close the open segments in the directory given as first argument, and print the path of each.
-
-    A recorder, which holds the lock, passes the journal that it writes as second argument, or ``-``. Without a second
-    argument this process takes the lock itself.
-    """
-    directory, but = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
-    if but not in (None, _NONE):
-        # The recorder is still running and does not wait for the result.
-        step_back()
-    try:
-        if but is None:
-            FolderOwner(directory, LOCK).take()  # until the process ends
-        for path in close_left_open(directory, None if but in (None, _NONE) else Path(but)):
-            print(path)
-    except OSError as error:
-        print(f"{error.strerror or error}", file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_worker(_close))

@@ -71,9 +71,9 @@ MEMORY_INFERENCE = InferenceConfig(ard=False, width_range=(0.1, 50.0))
 _FLOOR = 1e-4
 
 
-def two_inputs(u_V: FloatArray, dt_s: float = DT_S * EVERY) -> FloatArray:
-    """(n, 2): voltage V and its backward difference V/s (2.41) of (n,) samples ``dt_s`` apart."""
-    return np.column_stack([u_V, backward_difference(u_V, dt_s)])
+def two_inputs(u_V: FloatArray) -> FloatArray:
+    """(n, 2): voltage V and its backward difference V/s (2.41) of (n,) samples 0.02 s apart."""
+    return np.column_stack([u_V, backward_difference(u_V, DT_S * EVERY)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +92,7 @@ class TwoInputLssvm:
         return self.output.denormalise(self.model.predict(self.inputs.normalise(rows)))
 
 
-def fit_two_inputs(
-    u_V: FloatArray, y_um: FloatArray, hyper: tuple[float, float] | None = None, config: InferenceConfig | None = None
-) -> TwoInputLssvm:
+def fit_two_inputs(u_V: FloatArray, y_um: FloatArray, hyper: tuple[float, float] | None = None) -> TwoInputLssvm:
     """From (n,) voltages and displacements 0.02 s apart; ``hyper`` = (gamma, sigma) skips the inference.
 
     Raises InputError on shapes, NumericsError where the evidence cannot be evaluated.
@@ -104,7 +102,7 @@ def fit_two_inputs(
     X, target = inputs.normalise(rows), output.normalise(y_um)
     found = None
     if hyper is None:
-        found = infer(evidence_samples(X, target), config or CHAPTER_INFERENCE).best
+        found = infer(evidence_samples(X, target), CHAPTER_INFERENCE).best
         gamma, widths = found.gamma, found.widths
     else:
         gamma, widths = hyper[0], np.full(2, hyper[1])
@@ -140,7 +138,7 @@ def _features(features: FeatureMap, u_V: FloatArray) -> tuple[FloatArray, FloatA
     return np.ascontiguousarray(basis[::EVERY]), np.ascontiguousarray(kernel[::EVERY])
 
 
-def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = MEMORY) -> MemoryLssvm:
+def fit_memory(u_fine_V: FloatArray, y_um: FloatArray) -> MemoryLssvm:
     """From the commanded voltage (m,), 1 ms apart, and displacements (ceil(m/20),), 0.02 s apart.
 
     Raises InputError where the lengths do not fit together.
@@ -148,7 +146,7 @@ def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = 
     if y_um.shape != u_fine_V[::EVERY].shape:
         raise InputError(f"y_um: got {y_um.shape}, expected {u_fine_V[::EVERY].shape}: one for {EVERY} of u_fine_V")
     # Thresholds and scales come from the voltage, which has the role of the displacement in the inverse.
-    features = replace(design_features(_motion(u_fine_V), DT_S, config, True), y_rest_um=0.0)
+    features = replace(design_features(_motion(u_fine_V), DT_S, MEMORY, True), y_rest_um=0.0)
     basis, kernel = _features(features, u_fine_V)
     span = float(np.ptp(y_um))
     deviations = prior_deviations(features, span)

@@ -25,7 +25,7 @@ from tests.foreign.plants import random_plant
     ],
 )
 def test_no_large_error_and_no_trouble_with_an_intact_stage(event: str, seed: int, preset: str) -> None:
-    record = run_one(event, seed, preset, after_s=4.0)
+    record = run_one(event, seed, after_s=4.0, as_drawn=preset == "as_drawn")
     assert "failed" not in record
     assert record["troubles"] == []
     assert record["adaptive"]["large_s"] <= LARGE_S

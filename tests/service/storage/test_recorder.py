@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dehyst.service.background.job import BackgroundJob
 from dehyst.service.storage import segments as recorder_files
 from dehyst.service.storage.recorder import ASIDE, Recorder, RecorderConfig
 from dehyst.service.storage.segments import Journal, Rows, read_journal, segments
@@ -161,7 +162,7 @@ def test_a_full_disk_degrades_the_recording_and_nothing_else(
         return call
 
     if where == "close":
-        monkeypatch.setattr(recorder_files.Closer, "__init__", failing(recorder_files.Closer.__init__))
+        monkeypatch.setattr(BackgroundJob, "_work", failing(BackgroundJob._work))
     else:
         name = {"open": "__init__", "write": "write"}[where]
         monkeypatch.setattr(Journal, name, failing(getattr(Journal, name)))
