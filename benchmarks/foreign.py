@@ -11,6 +11,9 @@ the file holds that many hours of simulated time, and prints each trouble that w
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
 on stages on which nothing happens.
+
+``--controllers 1 5 20 --runs 10`` runs the corrections beside other controllers, with readings so many samples old
+(``lab.rehearsal.controllers``), and prints medians and worst ones. A stage takes a minute or two.
 """
 
 from __future__ import annotations
@@ -25,13 +28,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import foreign_motions
+from benchmarks.correction import course_of
 from benchmarks.records import Record, add_line, read_lines, recorded, why_failed
-from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
+from dehyst.lab.rehearsal import Event, RehearsalConfig, controllers, identify, run_event
 from dehyst.lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import MOTIONS, motion
@@ -109,6 +114,16 @@ def healthy_s(seed: int) -> float:
     return float(np.clip(HEALTHY_SAMPLES * random_plant(seed).traits.dt_s, *HEALTHY_S))
 
 
+def run_controllers(seed: int, ages: Sequence[int]) -> Record:
+    """All controllers on a stage, as JSON values. If it raises, the record holds the traceback."""
+    record: Record = {"seed": seed, "ages": list(ages)}
+    with recorded(record):
+        course = course_of(seed)
+        found = controllers.compare(course.make, course.known, course.low_V, course.mode_Hz, ages, seed)
+        record |= {"hysteresis": course.name, "controllers": [asdict(one) for one in found]}
+    return record
+
+
 # ---- plans
 
 
@@ -122,7 +137,7 @@ def motion_runs(given: argparse.Namespace) -> list[Run]:
     recording = foreign_motions.RECORDINGS[given.poor]
     return [
         (
-            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after),
+            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after, given.true_length),
             {"seed": seed, "recording": recording, "motion": name},
         )
         for name, seed in foreign_motions.planned(given.motions, given.first_seed, given.runs)
@@ -406,11 +421,32 @@ def _notable(record: Record) -> bool:
     return "failed" in record or bool(record["troubles"]) or record["figures"]["large_s"] > LARGE_S
 
 
+def controllers_table(records: Sequence[Record]) -> str:
+    """Median and worst of all stages, by controller and age."""
+    by_row: dict[tuple[str, int], list[list[float]]] = {}
+    for record in records:
+        for one in record.get("controllers", ()):
+            errors = [one["moving_pct"], one["first_second_pct"], *one["lines_pct"]]
+            by_row.setdefault((one["way"], one["age"]), []).append(errors)
+    rows = [
+        (
+            controllers.WAYS[way], str(age),
+            *(f"{np.median(column):.3f} / {max(column):.3f}" if np.isfinite(column).all() else "-"
+              for column in zip(*errors, strict=True)),
+        )
+        for (way, age), errors in by_row.items()
+    ]  # fmt: skip
+    stages = sum("controllers" in record for record in records)
+    return f"{stages} stages, median / worst, % of the range:\n\n{markdown(controllers.HEAD, rows)}"
+
+
 def told(record: Record) -> str:
     """A run in one line."""
     first = f"seed {record['seed']} "
     if "failed" in record:
         return f"{first}{record.get('class', record.get('motion', ''))}: {why_failed(record)}"
+    if "ages" in record:
+        return f"{first}{record['hysteresis']}: {len(record['controllers'])} rows, {record['cpu_s']:.0f} s"
     first += f"{record['stage']['hysteresis']} {_rate_Hz(record)} Hz, "
     if "motion" in record:
         first += foreign_motions.told(record)
@@ -452,6 +488,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument("--poor", action="store_true", help="--motions: identify from 2 s of half the stroke")
     parser.add_argument(
+        "--true-length", action="store_true", help="--motions: hold for an hour, stand for a night; takes hours"
+    )
+    parser.add_argument(
         "--block", type=int, default=5, metavar="N",
         help="samples per query and snapshot of --healthy (5): fewer queries cost less, and answers are older",
     )  # fmt: skip
@@ -464,7 +503,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--motions", metavar="NAME[,NAME]",
         help=f"run motions on stages on which nothing happens: {', '.join(MOTIONS)}; raster:10 is one of 10 Hz",
     )  # fmt: skip
-    only.add_argument("--controllers", nargs="*", help=argparse.SUPPRESS)
+    only.add_argument(
+        "--controllers", nargs="+", type=int, metavar="AGE",
+        help="run the corrections beside other controllers, with readings so many samples old",
+    )  # fmt: skip
     only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
     only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
     given = parser.parse_args(arguments)
@@ -473,8 +515,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jobs = given.jobs if given.jobs is not None else 2 if given.line else 1
     if given.runs < 1 or jobs < 1 or given.first_seed < 0:
         parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
-    if given.controllers is not None:
-        parser.error("--controllers: gone; call python -m benchmarks.correction --first SEED --stages N")
+    if any(age < 1 for age in given.controllers or ()):
+        parser.error(f"--controllers: got {min(given.controllers)}, expected ages of 1 sample or more")
     given.motions = given.motions.split(",") if given.motions is not None else []
     for name in given.motions:
         try:
@@ -500,10 +542,12 @@ def tables(records: Sequence[Record]) -> str:
         table: [],
         healthy_table: [],
         foreign_motions.table: [],
+        controllers_table: [],
     }
     for record in records:
         healthy = record.get("class") == HEALTHY
-        parts[foreign_motions.table if "motion" in record else healthy_table if healthy else table].append(record)
+        made = foreign_motions.table if "motion" in record else controllers_table if "ages" in record else table
+        parts[healthy_table if healthy else made].append(record)
     return "\n\n".join(made(part) for made, part in parts.items() if part) or table([])
 
 
@@ -523,6 +567,9 @@ def _carry_out(given: argparse.Namespace, jobs: int) -> list[Record]:
         seeds = range(given.first_seed, given.first_seed + given.runs)
         classes = given.only or list(CLASSES)
         plan = event_runs([(classes[seed % len(classes)], seed) for seed in seeds], given.after)
+        if given.controllers:
+            ages = given.controllers
+            plan = [(functools.partial(run_controllers, seed, ages), {"seed": seed, "ages": ages}) for seed in seeds]
     plan = [(run, named) for run, named in plan if not any(named.items() <= record.items() for record in records)]
     for k, record in enumerate(run_all(plan, jobs), 1):
         records.append(record)

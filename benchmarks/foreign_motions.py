@@ -33,8 +33,9 @@ BAND: Final = (0.05, 0.95)
 FROM_S, AFTER_S = 5.0, 6.0
 #: A run is cut to so many samples, but errors count for at least so many seconds.
 MOST_SAMPLES, LEAST_S = 60_000, 2.0
-#: Rests, s and samples at most.
+#: Rests: in the short runs, s and samples at most; true lengths, s.
 STILL_S, STILL_SAMPLES = 30.0, 30_000
+TRUE_S: Final = {"hold": 3600.0, "night": 8 * 3600.0}
 #: Motions from this frequency on need this sample rate, Hz; tones from this one on a first mode this high, or none.
 FAST_HZ, FAST_RATE_HZ = 20.0, 1000.0
 FAST_TONE_HZ, FAST_TONE_MODE_HZ = 50.0, 300.0
@@ -84,7 +85,9 @@ def _fitting(name: str, first_seed: int) -> Iterator[int]:
     return (seed for seed in itertools.count(first_seed) if fits(name, seed, random_plant(seed).traits))
 
 
-def run_motion(name: str, seed: int, recording: str = "full", after_s: float = AFTER_S) -> Record:
+def run_motion(
+    name: str, seed: int, recording: str = "full", after_s: float = AFTER_S, true_length: bool = False
+) -> Record:
     """One motion on one stage, learning and frozen, as JSON values. If it raises, the record holds the traceback."""
     record: Record = {"seed": seed, "recording": recording, "motion": name}
     with recorded(record):
@@ -93,9 +96,11 @@ def run_motion(name: str, seed: int, recording: str = "full", after_s: float = A
         dt_s = traits.dt_s
         maker = motion(name)
         if maker.rests:
-            maker = replace(maker, still_s=min(STILL_S, STILL_SAMPLES * dt_s))
+            still_s = TRUE_S[maker.rests] if true_length else min(STILL_S, STILL_SAMPLES * dt_s)
+            maker = replace(maker, still_s=still_s)
         from_s = maker.begin_s(seed) + FROM_S
-        duration_s = from_s + min(after_s, max(MOST_SAMPLES * dt_s - from_s, LEAST_S))
+        cut_s = math.inf if true_length else max(MOST_SAMPLES * dt_s - from_s, LEAST_S)
+        duration_s = from_s + min(after_s, cut_s)
         low_V, high_V = traits.excite_V
         poor = recording == "poor"
         config = RehearsalConfig(

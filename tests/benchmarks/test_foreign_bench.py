@@ -83,7 +83,7 @@ def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
         (["--only", "earthquake"], "expected some of none"),
         (["--runs", "0"], "expected at least 1"),
         (["--after", "1"], "expected 4 s or more"),
-        (["--controllers", "5"], "call python -m benchmarks.correction"),
+        (["--controllers", "5", "0"], "expected ages of 1 sample or more"),
         (["--line", "--table", "x"], "not allowed with"),
     ],
 )
@@ -93,6 +93,28 @@ def test_what_cannot_be_asked_for_is_refused(
     with pytest.raises(SystemExit):
         main(arguments)
     assert words in capsys.readouterr().err
+
+
+def test_controllers_are_shown_by_median_and_worst(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def stage(seed: int, moving_pct: float | None) -> dict[str, Any]:
+        one = {
+            "way": "I",
+            "age": 5,
+            "moving_pct": moving_pct,
+            "first_second_pct": 0.2,
+            "lines_pct": [4.0, 3.0, 2.0, 1.0],
+        }
+        return {"seed": seed, "ages": [5], "hysteresis": "plays", "cpu_s": 1.0, "controllers": [one]}
+
+    file = tmp_path / "controllers.jsonl"
+    file.write_text(
+        "".join(json.dumps(stage(k, 0.1 * k)) + "\n" for k in (1, 2, 4))
+        + json.dumps({"seed": 5, "ages": [5], "failed": "ValueError: no"})
+    )
+    assert main(["--table", str(file)]) == 1
+    said = capsys.readouterr().out
+    assert "3 stages" in said
+    assert "| an integrator alone | 5 | 0.200 / 0.400 | 0.200 / 0.200 | 4.000 / 4.000 |" in said
 
 
 def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
