@@ -1,4 +1,4 @@
-"""What each rule and each setting of the learner is worth: without the rule, and with half and twice the setting.
+"""What each rule and each constant of the learner is worth: without the rule, and with half and twice the constant.
 
 ``python -m benchmarks.ablation --json out/ablation.jsonl`` runs the learner as it is over short cases, then once for
 each variant, and prints what gets worse. A variant without any row that gets worse beyond chance is worth nothing on
@@ -6,8 +6,11 @@ these cases. The file is continued where it ends, if the code of the learner and
 
 Variants
 --------
-rules : those of `RULES` are switched off, one at a time.
-settings (``--fields``) : the numbers of the learner's frozen configuration, half and twice; integers rounded.
+rules : those of `RULES` are switched off, one at a time, each in a process forked from this one.
+fields (``--fields``) : half and twice each number of the learner's frozen configuration, integers rounded.
+constants (``--constants``) : likewise each number that a module of ``adaptive/online`` assigns, each in a copy of the
+    source, since compiled code does not see a changed constant. A copy is compiled anew, which takes some two minutes
+    of processor time before its first case: name the constants that are in doubt (``--rules``).
 
 Cases
 -----
@@ -34,18 +37,23 @@ by more than ``CUT`` times what chance does to it, or a verdict is, it is open w
 from __future__ import annotations
 
 import argparse
+import ast
 import functools
+import gc
 import hashlib
 import itertools
-import json
 import math
 import multiprocessing
+import os
 import resource
+import shutil
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -57,6 +65,7 @@ import dehyst.adaptive.online
 from benchmarks.foreign import LARGE_S, NAMED_S
 from benchmarks.foreign_motions import BAND
 from benchmarks.measured import RECORDS, Cut, data_folder, learnt
+from benchmarks.records import add_line, read_lines
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
@@ -187,13 +196,13 @@ class RecordCase:
     @classmethod
     def of(cls, cut: Cut, name: str) -> RecordCase:
         """Raises what an identification raises."""
-        n = cut.split
-        last = min(cut.u_V.size, n + SAMPLES + 2 * LATER)
+        last = min(cut.u_V.size, cut.split + SAMPLES + 2 * LATER)
         cut = replace(cut, u_V=cut.u_V[:last], y_um=cut.y_um[:last])
-        model = identify_one(LEARN, cut.u_V[:n], cut.y_um[:n], cut.dt_s, 500)
+        train_V = cut.u_V[: cut.split]
+        model = identify_one(LEARN, train_V, cut.y_um[: cut.split], cut.dt_s, 500)
         assert isinstance(model, LssvmInverse)
-        span_V = float(np.ptp(cut.u_V[:n]))
-        return cls(name, "record", model, cut.whole.part(n, last), cut.dt_s, cut.limits, span_V)
+        test = cut.whole.part(cut.split, last)
+        return cls(name, "record", model, test, cut.dt_s, cut.limits, float(np.ptp(train_V)))
 
     def run(self, noise: int, settings: Settings) -> Numbers:
         test, dt_s = self.test.part(noise * LATER, len(self.test)), self.dt_s
@@ -344,14 +353,32 @@ RULES: Final = (
 
 
 @dataclass(frozen=True, slots=True)
+class Literal:
+    """A number in the source: the file under the root of the project, where it stands there, and what replaces it."""
+
+    path: Path
+    line: int
+    begin: int
+    end: int
+    new: str
+
+    def replace_in(self, root: Path) -> None:
+        lines = (root / self.path).read_bytes().splitlines(keepends=True)
+        line = lines[self.line - 1]
+        lines[self.line - 1] = line[: self.begin] + self.new.encode() + line[self.end :]
+        (root / self.path).write_bytes(b"".join(lines))
+
+
+@dataclass(frozen=True, slots=True)
 class Variant:
-    """One change of the learner. ``of`` : what it belongs to. ``begin`` : makes it, in a process of its own."""
+    """One change of the learner: a rule without which it runs, or other settings. ``of`` : what it belongs to."""
 
     name: str
     of: str
-    settings: Settings
-    begin: Callable[[], None]
+    rule: Rule | None = None
+    settings: Settings = field(default_factory=dict)
     value: str = ""
+    literal: Literal | None = None
 
 
 #: Names of the factors.
@@ -380,13 +407,55 @@ def field_variants() -> list[Variant]:
             label = f"{table or 'learner'}.{entry.name}"
             for name, factor in FACTORS.items():
                 new = {entry.name: scaled(value, factor)}
-                found.append(Variant(f"{label} {name}", label, {table: new} if table else new, _nothing, f"{value}"))
+                found.append(Variant(f"{label} {name}", label, None, {table: new} if table else new, f"{value}"))
+    return found
+
+
+#: Root of the project, and what the benchmark needs of it.
+ROOT: Final = Path(__file__).parents[1]
+NEEDED: Final = ("dehyst", "adaptive", "baselines", "sim", "service", "lab", "benchmarks", "tests")
+#: Marks, which are no constants.
+NO_CONSTANTS: Final = frozenset({"NOWHERE"})
+
+
+def constants() -> Iterator[tuple[str, Path, ast.Constant]]:
+    """(name, file, number) of each number but 0 that a module of ``adaptive/online`` assigns, alone or in a tuple."""
+    for path in sorted(Path(dehyst.adaptive.online.__file__).parent.glob("*.py")):
+        for node in ast.parse(path.read_bytes()).body:
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+                continue
+            target, value = node.targets[0] if isinstance(node, ast.Assign) else node.target, node.value
+            pairs = [(target, value)]
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs = list(zip(target.elts, value.elts, strict=True))
+            for target, value in pairs:
+                try:
+                    ast.literal_eval(value)
+                except ValueError:
+                    continue
+                numbers = [n for n in ast.walk(value) if isinstance(n, ast.Constant) and type(n.value) in (int, float)]
+                for at, number in enumerate(numbers):
+                    name = ast.unparse(target) + (f"[{at}]" if len(numbers) > 1 else "")
+                    if number.value and name not in NO_CONSTANTS:
+                        yield f"{path.stem}.{name}", path.relative_to(ROOT), number
+
+
+def constant_variants() -> list[Variant]:
+    """Half and twice each constant."""
+    found = []
+    for label, path, number in constants():
+        assert isinstance(number.value, int | float)
+        assert number.end_col_offset is not None
+        for name, factor in FACTORS.items():
+            new = repr(scaled(number.value, factor))
+            literal = Literal(path, number.lineno, number.col_offset, number.end_col_offset, new)
+            found.append(Variant(f"{label} {name}", label, value=repr(number.value), literal=literal))
     return found
 
 
 def rule_variants() -> list[Variant]:
     """Each rule switched off."""
-    return [Variant(rule.name, rule.name, {}, rule.switch_off) for rule in RULES]
+    return [Variant(rule.name, rule.name, rule) for rule in RULES]
 
 
 # --- Running.
@@ -394,59 +463,74 @@ def rule_variants() -> list[Variant]:
 
 #: A process may take this many times what the learner as it is takes, s of processor time at least.
 MOST_TIME, LEAST_S = 8.0, 60.0
+#: A copy of the source may take as much more to compile and to identify its stages.
+COMPILE_S: Final = 600.0
 
 
-def _work(
-    cases: Sequence[Case], variant: Variant, noise: int, towards: Connection, most_s: float
-) -> None:  # pragma: no cover - in a process
+def _work(cases: Sequence[Case], variant: Variant, noise: int, most_s: float, towards: Connection) -> None:
     """Run cases in a process of its own; sends (name, numbers) as they end."""
     resource.setrlimit(resource.RLIMIT_CPU, (int(most_s), int(most_s) + 5))
-    variant.begin()
+    if variant.rule:
+        variant.rule.switch_off()
     for case in cases:
         try:
             numbers = case.run(noise, variant.settings)
         except Exception as error:
             numbers = {"failed": f"{type(error).__name__}: {error}"[:200]}
         towards.send((case.name, numbers))
-    towards.close()
 
 
-@dataclass(slots=True)
-class Job:
-    """A process that runs a variant."""
+def _work_in_copy(select: Sequence[str], variant: Variant, most_s: float, towards: Connection) -> None:
+    """Run the learner as it is in a copy of the source with another number; sends (name, numbers) at the end.
 
-    variant: Variant
-    noise: int
-    source: Connection
-    process: Any
-    numbers: dict[str, Numbers]
+    select : options of the command that choose the cases.
+    """
+    assert variant.literal is not None
+    with tempfile.TemporaryDirectory(prefix="ablation-") as name:
+        root = Path(name)
+        for folder in NEEDED:
+            shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", root)
+        variant.literal.replace_in(root)
+        results = root / "results.jsonl"
+        command = [sys.executable, "-m", "benchmarks.ablation", "--bare", "--json", str(results), *select]
+        limit = (int(most_s + COMPILE_S), int(most_s + COMPILE_S) + 5)
+        resource.setrlimit(resource.RLIMIT_CPU, limit)
+        subprocess.run(command, cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, stderr=subprocess.DEVNULL)
+        for entry in read_lines([results]) if results.exists() else []:
+            for pair in entry["cases"].items():
+                towards.send(pair)
 
 
 def run_all(
-    plan: Sequence[tuple[Variant, int]], cases: Sequence[Case], jobs: int, seconds: float
+    plan: Sequence[tuple[Variant, int]], cases: Sequence[Case], select: Sequence[str], jobs: int, most_s: float
 ) -> Iterator[tuple[Variant, int, dict[str, Numbers]]]:
-    """(variant, noise, numbers by case) as they end; each in a forked process. ``seconds``: of an ordinary one."""
-    context, running, waiting = multiprocessing.get_context("fork"), list[Job](), list(plan)
-    most_s = max(LEAST_S, MOST_TIME * seconds)
+    """(variant, noise, numbers by case) as they end; each in a forked process, which may take ``most_s``.
+
+    select : options of the command that choose ``cases``.
+    """
+    context, waiting = multiprocessing.get_context("fork"), list(plan)
+    running: dict[Any, tuple[Variant, int, Any, dict[str, Numbers]]] = {}
     while waiting or running:
         while waiting and len(running) < jobs:
             variant, noise = waiting.pop(0)
             source, towards = context.Pipe(duplex=False)
-            process = context.Process(target=_work, args=(cases, variant, noise, towards, most_s))
+            if variant.literal:
+                process = context.Process(target=_work_in_copy, args=(select, variant, most_s, towards))
+            else:
+                process = context.Process(target=_work, args=(cases, variant, noise, most_s, towards))
             process.start()
             towards.close()
-            running.append(Job(variant, noise, source, process, {}))
-        ready = wait([job.source for job in running])
-        for job in [job for job in running if job.source in ready]:
+            running[source] = (variant, noise, process, {})
+        for source in wait(list(running)):
+            variant, noise, process, numbers = running[source]
             try:
-                name, numbers = job.source.recv()
-                job.numbers[name] = numbers
+                numbers.update([source.recv()])
             except EOFError:
-                job.process.join()
-                running.remove(job)
-                for case in cases:
-                    job.numbers.setdefault(case.name, {"failed": f"the process ended: {job.process.exitcode}"})
-                yield job.variant, job.noise, job.numbers
+                process.join()
+                del running[source]
+                ended = {"failed": f"the process ended: {process.exitcode}"}
+                yield variant, noise, {case.name: numbers.get(case.name, ended) for case in cases}
 
 
 # --- Comparison.
@@ -606,29 +690,34 @@ def _told(results: Results, name: str) -> str:
 
 def table(results: Results) -> str:
     """Markdown: what changes nothing first, then what changes no row beyond chance, then what is worth its place."""
-    nothing, worthless, unsure, worth = kinds = (
-        "changes nothing, to the last bit", "worth nothing: no row and no case gets worse beyond chance",
-        "open: single cases get worse, no row does", "worth its place",
-    )  # fmt: skip
-    parts: dict[str, list[tuple[str, ...]]] = {kind: [] for kind in kinds}
-    for of, grouped in itertools.groupby(results.planned, lambda variant: variant.of):
-        variants = list(grouped)
-        if any(v.name not in results.variants for v in variants):
+    groups: dict[str, list[Variant]] = {}
+    for variant in results.planned:
+        groups.setdefault(variant.of, []).append(variant)
+    parts: dict[str, list[tuple[str, ...]]] = {
+        "changes nothing, to the last bit": [], "worth nothing: no row and no case gets worse beyond chance": [],
+        "open: single cases get worse, no row does": [], "worth its place": [],
+    }  # fmt: skip
+    kinds = list(parts)
+    for of, variants in groups.items():
+        names = [variant.name for variant in variants]
+        if not results.variants.keys() >= {*names}:
             continue
-        cells = [_told(results, v.name) for v in variants]
-        shifts = {v.name: f"{v.name.removeprefix(of).strip()} " if len(variants) > 1 else "" for v in variants}
+        cells = [_told(results, name) for name in names]
+        shifts = {name: f"{name.removeprefix(of).strip()} ".lstrip() for name in names}
         better = [f"{shift}{row}" for name, shift in shifts.items() for row in results.worse(name, -1)]
         single = [f"{shift}{text}" for name, shift in shifts.items() for text in results.single(name)]
-        same, matters = all(cell == "the same" for cell in cells), any(results.worse(v.name) for v in variants)
-        kind = nothing if same else worth if matters else unsure if single else worthless
-        parts[kind].append((of, variants[0].value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single)))
+        line = (of, variants[0].value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single))
+        worth = any(results.worse(name) for name in names)
+        parts[kinds[0 if {*cells} == {"the same"} else 3 if worth else 2 if single else 1]].append(line)
     cases = sum(len(names) for names in results.groups.values())
     texts = [
         f"{cases} cases ({', '.join(f'{len(names)} {group}' for group, names in results.groups.items())}), "
         f"{len(results.variants)} of {len(results.planned)} variants; other noise alone makes {results.by_chance()} "
         "worse by this rule"
     ]
-    texts += [f"### {kind} ({len(lines)})\n\n{markdown(HEAD, lines)}" for kind, lines in parts.items() if lines]
+    for kind, lines in parts.items():
+        if lines:
+            texts.append(f"### {kind} ({len(lines)})\n\n{markdown(HEAD, lines)}")
     return "\n\n".join(texts)
 
 
@@ -650,12 +739,15 @@ REPEATED: Final = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the variants, and print the table."""
+    """Run the variants, or print the table of a file."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.ablation", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rules", default="", metavar="NAME[,NAME]", help="only rules with one of these in the name")
-    parser.add_argument("--fields", action="store_true", help="the fields of the learner's configuration, not rules")
+    parser.add_argument("--rules", default="", metavar="NAME[,NAME]", help="only what has one of these in its name")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--fields", action="store_true", help="the fields of the learner's configuration instead")
+    kinds.add_argument("--constants", action="store_true", help="the constants in the learner's source instead")
+    kinds.add_argument("--bare", action="store_true", help="no variant: add the learner as it is to --json, and end")
     parser.add_argument("--only", default="", metavar="CASE", help="cases with this in the name")
     parser.add_argument("--quick", action="store_true", help="fewer than half of the cases")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (1)")
@@ -663,64 +755,81 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--table", type=Path, metavar="FILE", help="write the table here, again after each variant")
     given = parser.parse_args(arguments)
     if given.jobs < 1:
-        parser.error("--jobs: expected at least 1")
-    planned = field_variants() if given.fields else rule_variants()
-    planned = [variant for variant in planned if any(name in variant.of for name in given.rules.split(","))]
-    if not planned:
-        parser.error(f"--rules: got {given.rules!r}, expected parts of the names of rules")
+        parser.error(f"--jobs: got {given.jobs}, expected at least 1")
+    planned = field_variants() if given.fields else constant_variants() if given.constants else rule_variants()
+    wanted = given.rules.split(",")
+    for name in wanted:
+        if not any(name in variant.of for variant in planned):
+            parser.error(f"--rules: got {name!r}, expected a part of a name: {', '.join({v.of: 0 for v in planned})}")
+    planned = [variant for variant in planned if any(name in variant.of for name in wanted)]
     begun = time.monotonic()
     cases = all_cases(given.quick, given.only)
     if not cases:
         parser.error(f"--only: got {given.only!r}, expected a part of a case's name")
     _say(f"{len(cases)} cases prepared in {time.monotonic() - begun:.0f} s")
-    print(table(ablate(cases, planned, given.jobs, given.json, given.table)))
+    if given.bare:
+        add_line(given.json, {"mark": fingerprint(cases), "variant": UNMODIFIED, "cases": as_it_is(cases)})
+        return 0
+    select = (["--quick"] if given.quick else []) + ["--only", given.only]
+    print(table(ablate(cases, planned, given.jobs, given.json, given.table, select)))
     return 0
 
 
 def ablate(
-    cases: Sequence[Case], planned: Sequence[Variant], jobs: int = 1, path: Path | None = None, to: Path | None = None
-) -> Results:
+    cases: Sequence[Case], planned: Sequence[Variant], jobs: int = 1, path: Path | None = None, to: Path | None = None,
+    select: Sequence[str] = (),
+) -> Results:  # fmt: skip
     """Run the learner as it is, its repetitions, and the variants that ``path`` does not hold yet.
 
-    ``to`` : file for the table, written anew after each variant. Exits where a case does not give the same twice.
+    select : options of the command that choose ``cases``, for the copies of the source.
+    ``to`` : file for the table, written anew after each variant. Exits where a case gives other numbers than before.
     """
     groups = {group: [case.name for case in cases if case.group == group] for group in GROUPS}
+    groups = {group: names for group, names in groups.items() if names}
     mark = fingerprint(cases)
     done = read(path, mark)
-    # As it is, in this process, which loads all that is compiled; twice, to see that the numbers repeat.
-    base, begin = {case.name: case.run(0, {}) for case in cases}, time.process_time()
-    again = {case.name: case.run(0, {}) for case in cases}
+    # In this process, which loads all that is compiled.
+    begin = time.process_time()
+    base = as_it_is(cases)
     seconds = time.process_time() - begin
-    if changed := different(again, base):
-        raise SystemExit(f"{changed[0]}: not deterministic: {base[changed[0]]}, then {again[changed[0]]}")
-    for name, numbers in base.items():
-        _say(f"{name}: {', '.join(f'{key} {value:.3g}' for key, value in numbers.items())}")
     if UNMODIFIED not in done:
-        add(path, mark, UNMODIFIED, base)
+        add_line(path, {"mark": mark, "variant": UNMODIFIED, "cases": base})
     elif changed := different(done[UNMODIFIED], base):
         raise SystemExit(f"{path}: {changed[0]} came to other numbers than now: another machine, or another build")
-    plan = [(Variant(f"{NOISE} {k}", NOISE, {}, _nothing), k) for k in range(1, REPEATED + 1)]
-    plan = [entry for entry in (*plan, *((variant, 0) for variant in planned)) if entry[0].name not in done]
+    noises = {f"{NOISE} {k}": k for k in range(1, REPEATED + 1)}
+    plan = [(Variant(name, NOISE), k) for name, k in noises.items()] + [(variant, 0) for variant in planned]
+    plan = [entry for entry in plan if entry[0].name not in done]
     _say(f"{len(plan)} variants to run, {len(done)} results in the file")
-    repeated = [done[name] for k in range(1, REPEATED + 1) if (name := f"{NOISE} {k}") in done]
     known = {variant.name for variant in planned}
-    results = Results(
-        base, repeated, {group: names for group, names in groups.items() if names},
-        {name: numbers for name, numbers in done.items() if name in known}, planned,
-    )  # fmt: skip
+    repeated = [numbers for name, numbers in done.items() if name in noises]
+    results = Results(base, repeated, groups, {name: n for name, n in done.items() if name in known}, planned)
+    # What is kept in the caches of functions was computed with all rules.
+    for made in [made for made in gc.get_objects() if isinstance(made, functools._lru_cache_wrapper)]:
+        made.cache_clear()
     begun = time.monotonic()
-    for count, (variant, noise, numbers) in enumerate(run_all(plan, cases, jobs, seconds), 1):
-        add(path, mark, variant.name, numbers)
+    for k, (variant, noise, numbers) in enumerate(
+        run_all(plan, cases, select, jobs, max(LEAST_S, MOST_TIME * seconds)), 1
+    ):
+        add_line(path, {"mark": mark, "variant": variant.name, "cases": numbers})
         if noise:
             repeated.append(numbers)
         else:
             results.variants[variant.name] = numbers
-        left_s = (len(plan) - count) * (time.monotonic() - begun) / count
+        left_s = (len(plan) - k) * (time.monotonic() - begun) / k
         said = f"{len(different(numbers, base))} cases differ" if noise else _told(results, variant.name)
         _say(f"[{left_s / 60.0:.0f} min left] {variant.name}: {said}")
         if to and repeated:
             to.write_text(table(results) + "\n")
     return results
+
+
+def as_it_is(cases: Sequence[Case]) -> dict[str, Numbers]:
+    """The numbers of the unmodified learner by case."""
+    found = {}
+    for case in cases:
+        found[case.name] = case.run(0, {})
+        _say(f"{case.name}: {', '.join(f'{name} {value:.3g}' for name, value in found[case.name].items())}")
+    return found
 
 
 def _say(text: str) -> None:
@@ -729,25 +838,8 @@ def _say(text: str) -> None:
 
 def read(path: Path | None, mark: str) -> dict[str, ByCase]:
     """The results in a file by variant, of the same learner and cases."""
-    found = dict[str, ByCase]()
-    if path is None or not path.exists():
-        return found
-    for line in path.read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:
-            continue  # cut off
-        if entry["mark"] == mark:
-            found[entry["variant"]] = entry["cases"]
-    return found
-
-
-def add(path: Path | None, mark: str, name: str, cases: ByCase) -> None:
-    """Add a line to a file."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(json.dumps({"mark": mark, "variant": name, "cases": cases}) + "\n")
+    entries = read_lines([path]) if path and path.exists() else []
+    return {entry["variant"]: entry["cases"] for entry in entries if entry["mark"] == mark}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""The benchmark of ablations: what its rules replace, and what it calls worse."""
+"""The benchmark of ablations: what it switches off, and what it calls worse."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,46 @@ import numpy as np
 import pytest
 
 from benchmarks import ablation
-from benchmarks.ablation import RULES, Numbers, Settings, Variant, ablate, field_variants, table, worse_rows
-from dehyst.adaptive.online import learner
+from benchmarks.ablation import (
+    RULES,
+    Numbers,
+    Settings,
+    Variant,
+    ablate,
+    constant_variants,
+    constants,
+    field_variants,
+    rule_variants,
+    table,
+    worse_rows,
+)
 from dehyst.adaptive.online.learner import Judgement
 
 
-def test_every_rule_replaces_what_is_there() -> None:
-    assert all(name in vars(owner) for rule in RULES for owner, name, _ in rule.replaces)
-    assert len({variant.name for variant in field_variants()}) > 50
+def test_every_rule_replaces_what_is_there_and_every_variant_has_a_name_of_its_own() -> None:
+    for rule in RULES:
+        for owner, name, _ in rule.replaces:
+            assert name in vars(owner), rule.name
+    assert len({variant.name for variant in (*rule_variants(), *field_variants())}) > 80
+
+
+def test_a_copy_of_the_source_holds_the_shifted_constant(tmp_path: Path) -> None:
+    variants = {variant.name: variant for variant in constant_variants()}
+    assert len(variants) == 2 * len(list(constants())) > 60
+    literal = variants["learner.ROLLBACK_S twice"].literal
+    assert literal is not None
+    (tmp_path / literal.path).parent.mkdir(parents=True)
+    before = (ablation.ROOT / literal.path).read_text().splitlines()
+    (tmp_path / literal.path).write_text("\n".join(before))
+    literal.replace_in(tmp_path)
+    changed = [
+        (old, new)
+        for old, new in zip(before, (tmp_path / literal.path).read_text().splitlines(), strict=True)
+        if old != new
+    ]
+    ((old, new),) = changed
+    value = float(variants["learner.ROLLBACK_S twice"].value)
+    assert old.replace(repr(value), repr(2.0 * value)) == new
 
 
 # ---- comparison
@@ -72,30 +106,43 @@ def cases() -> list[ablation.Case]:
     return [FallbackCase(f"stage {seed}", seed) for seed in range(8)]
 
 
-def begins(name: str, value: float) -> Variant:
-    rule = ablation.Rule(name, ((learner, name, value),))
-    return Variant(name, name, {}, rule.switch_off, "as it is")
+def rule(name: str) -> Variant:
+    return next(variant for variant in rule_variants() if variant.name == name)
 
 
-def test_a_variant_that_matters_is_told_from_one_that_does_not(
+def test_a_rule_that_matters_is_told_from_one_that_does_not(
     cases: list[ablation.Case], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    planned = [begins("FALLBACK_RATIO", 2.0 * learner.FALLBACK_RATIO), begins("LONG_S", 2.0 * learner.LONG_S)]
+    planned = [rule("fall back to the frozen model"), rule("outliers are refused by the filter")]
     path, to = tmp_path / "a.jsonl", tmp_path / "table.md"
-    before = learner.FALLBACK_RATIO
     results = ablate(cases, planned, jobs=2, path=path, to=to)
-    assert before == learner.FALLBACK_RATIO
-    assert [row.measure for row in results.worse("FALLBACK_RATIO")] == ["median"]
-    assert "LONG_S: the same" in capsys.readouterr().err
+    assert [row.measure for row in results.worse("fall back to the frozen model")] == ["median"]
+    assert "outliers are refused by the filter: the same" in capsys.readouterr().err
     _, nothing, worth = to.read_text().split("###")
     assert nothing.startswith(" changes nothing, to the last bit (1)")
-    assert "LONG_S | as it is | the same | -" in nothing
     assert worth.startswith(" worth its place (1)")
-    assert "FALLBACK_RATIO" in worth
+    assert "| fall back to the frozen model |" in worth
     assert table(results) + "\n" == to.read_text()
 
-    again = ablate(cases, [*planned, begins("SHORT_S", 2.0 * learner.SHORT_S)], path=path)
+    again = ablate(cases, [*planned, rule("validity")], path=path)
     said = capsys.readouterr().err
-    assert "FALLBACK_RATIO:" not in said
-    assert "SHORT_S: " in said
-    assert again.worse("FALLBACK_RATIO") == results.worse("FALLBACK_RATIO")
+    assert "fall back" not in said
+    assert "validity: the same" in said
+    assert again.worse("fall back to the frozen model") == results.worse("fall back to the frozen model")
+
+
+class DyingCase(FallbackCase):
+    """A case that ends its process when a rule is off."""
+
+    def run(self, noise: int, settings: Settings) -> Numbers:
+        if multiprocessing.parent_process() and not noise:
+            os._exit(3)
+        return super().run(noise, settings)
+
+
+def test_a_variant_whose_process_ends_has_failed_in_all_cases_left(cases: list[ablation.Case]) -> None:
+    dying = [*cases[:2], *(DyingCase(f"dies {seed}", seed) for seed in range(2))]
+    results = ablate(dying, [rule("validity")])
+    ended = [numbers.get("failed") for numbers in results.variants["validity"].values()]
+    assert ended == [None, None, *["the process ended: 3"] * 2]
+    assert [str(row) for row in results.worse("validity")] == ["intact failed +2"]
