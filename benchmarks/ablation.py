@@ -357,7 +357,7 @@ def _number(node: ast.expr) -> Any:
 
 #: The order in which modules are taken; any other one comes after them.
 ORDER: Final = (
-    "sensor_trust", "intake", "glitch_or_jump", "learner", "dead_reckoning", "missing_motion", "gates", "drift"
+    "sensor_trust", "intake", "glitch_or_jump", "learner", "track", "gates", "drift"
 )  # fmt: skip
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dehyst.adaptive.fleet import windows
-from dehyst.adaptive.fleet.state import Fixed, Rows
+from dehyst.adaptive.fleet import step
+from dehyst.adaptive.fleet.step import Fixed, Rows
 from dehyst.adaptive.online.kernel_window import NOWHERE, SAME
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
@@ -24,7 +24,7 @@ from dehyst.adaptive.window.arrays import ACCEPTED, WindowArrays
 
 
 class TorchWindows:
-    """Windows of B axes. See `adaptive.fleet.windows.CompiledWindows`."""
+    """Windows of B axes. See `adaptive.fleet.step.CompiledWindows`."""
 
     shares = False
     #: All matrices are written from the start; see `CompiledWindows.unwritten`.
@@ -101,7 +101,7 @@ class TorchWindows:
         s.born[done, slot] = turns["clock"][done]
         rest = ~good
         said = np.empty(int(rest.sum()), dtype=np.int64)
-        self._alone(axes[rest], windows.learn, w, said)
+        self._alone(axes[rest], step.learn, w, said)
         status[rest] = said
         return status
 
@@ -118,7 +118,7 @@ class TorchWindows:
         at, slot = axes[found], slot[found]
         good = self._reweight(at, slot, np.full(at.size, most))
         r["next"][at[good]] = slot[good] + 1
-        self._alone(at[~good], windows.let_go)
+        self._alone(at[~good], step.let_go)
 
     def _alone(self, axes: IntArray, work: Callable[..., None], *arguments: object) -> None:
         """Steps of some axes by the processor's compiled code, on copies that are taken over."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from dehyst.adaptive import kernels
+from dehyst.adaptive import features
 from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
@@ -17,8 +17,7 @@ from dehyst.adaptive.types import FloatArray, Hyperparameters, IntArray, StateDi
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, WindowArrays
-from dehyst.adaptive.window.healing import Healing, HealingState
-from dehyst.adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
+from dehyst.adaptive.window.window import Healing, HealingState, SolverConfig, SolverState, Window, WindowConfig
 
 Eviction = Literal["nearest", "fifo"]
 #: A sample with a kernel value above this to a held one takes its slot even where there are free slots.
@@ -168,7 +167,7 @@ class ResidualWindow:
         n = model.support.shape[0]
         if n:
             # The targets follow from the solution: y = K alpha + alpha / gamma. Its bias is in the linear part.
-            targets = kernels.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
+            targets = features.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
@@ -249,7 +248,7 @@ class ResidualWindow:
         """Learn one sample. Returns "learnt", or "numerics" where the step was refused and undone.
 
         A numerical refusal starts the healing of the window. The same solution is served, and steps that fail are
-        refused, until a new factorisation is swapped in `adaptive.window.healing.STEPS` samples later.
+        refused, until a new factorisation is swapped in `adaptive.window.window.HEALING_STEPS` samples later.
         """
         self._healing.step()
         A, n, x = self._window.arrays, len(self._window), np.ascontiguousarray(kernel, dtype=np.float64)

@@ -21,14 +21,12 @@ from dehyst.adaptive.features import ACCELERATION, VELOCITY, FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
 from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from dehyst.adaptive.online.glitch_or_jump import level_of
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow, due
-from dehyst.adaptive.online.missing_motion import MissingMotion
-from dehyst.adaptive.online.track import Pair
+from dehyst.adaptive.online.track import MissingMotion, Pair, Reckoning, drive_V
 from dehyst.adaptive.state import Entry, Refused, restore, save, within
 from dehyst.adaptive.types import (
     FloatArray,

@@ -19,7 +19,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.adaptive import kernels, lapack
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 
@@ -90,7 +90,7 @@ class Evidence:
     J2_curvature: float
 
 
-@lapack.one_thread
+@lssvm.one_thread
 def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
     """Evidence at one pair of gamma and widths (d,), with its gradients.
 
@@ -99,13 +99,13 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
     NumericsError : R is singular in double precision at these hyper-parameters.
     """
     n = data.size
-    K = kernels.gram(data.X, None, widths)
+    K = features.gram(data.X, None, widths)
     noise = 1.0 / (gamma * data.weights)
     P = K.copy()
     P[np.diag_indices(n)] += noise
-    lapack.cholesky_lower(P)
+    lssvm.cholesky_lower(P)
     log_det = 2.0 * float(np.sum(np.log(np.diag(P))))
-    lapack.inverse_from_cholesky(P)
+    lssvm.inverse_from_cholesky(P)
     Pc = np.tril(P, -1)
     Pc += Pc.T
     Pc[np.diag_indices(n)] = np.diag(P)

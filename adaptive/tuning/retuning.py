@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.lssvm import one_thread
 from dehyst.adaptive.online.kernel_window import SAME
 from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.tuning.evidence import evidence_samples

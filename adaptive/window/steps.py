@@ -6,7 +6,7 @@ Replacing slot k in the inverse form, with the kernel column b of the new sample
     P <- P - p p'/p_kk + q q'/s.
 
 S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and alpha = Sy - b S. The Cholesky form is
-described in `adaptive.window.cholesky_form`.
+described in `adaptive.window.forms`.
 
 Every function takes the arrays of the window and returns a `Status` as int, or a number. Nothing allocates and nothing
 raises. A step that would leave the finite numbers is refused, counted and taken back: samples, alpha and bias are then
@@ -19,11 +19,10 @@ from __future__ import annotations
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled, compiled_reassociating, dot
-from dehyst.adaptive.kernels import rbf_column
+from dehyst.adaptive.features import rbf_column
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import cholesky_form as cholesky
-from dehyst.adaptive.window import inverse_form as inverse
+from dehyst.adaptive.window import forms
 from dehyst.adaptive.window.arrays import WindowArrays, arrays_of
 
 # --- The kernel column of a point, and what the window predicts there.
@@ -201,11 +200,11 @@ def finish(A: WindowArrays) -> bool:
     rest = A.V[ws.ALPHA] if inverse_form else A.V[ws.Z]
     for j in range(n):
         rest[j] = sy[j]
-    inverse.add_scaled(rest, -A.F[ws.BETA], A.S, n)
+    forms.add_scaled(rest, -A.F[ws.BETA], A.S, n)
     good = good and bool(np.isfinite(A.F[ws.BETA])) and finite(rest, n)
     if inverse_form:
         return good
-    cholesky.backward(A, rest)
+    forms.backward(A, rest)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] = rest[i]
     return good and finite(rest, n)
@@ -224,9 +223,9 @@ def _scale_into(target: FloatArray, source: FloatArray, factor: float, n: int) -
 def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
     """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
     n = A.C[ws.COUNT]
-    inverse.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
+    forms.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
     A.S[slot] = 0.0
-    inverse.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
+    forms.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
     A.V[ws.SY, slot] = 0.0
 
 
@@ -234,8 +233,8 @@ def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
 def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
     n = A.C[ws.COUNT]
-    inverse.add_scaled(A.S, _add_up(q, n) / s, q, n)
-    inverse.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
+    forms.add_scaled(A.S, _add_up(q, n) / s, q, n)
+    forms.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
 
 
 @compiled_reassociating
@@ -243,9 +242,9 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
     n = A.C[ws.COUNT]
     b, z, p, q = A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.PK], A.V[ws.TRIAL]
     b[slot] = 0.0
-    inverse.multiply(A, b, z)
+    forms.multiply(A, b, z)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
-    inverse.lift_column(A, slot, p)
+    forms.lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
@@ -265,7 +264,7 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
         # _write_sample may not have run: restoring writes the same values again.
         _restore_solution(A)
         _restore_sample(A)
-        inverse.lower_column(A, slot, p)
+        forms.lower_column(A, slot, p)
         return ws.ILL_CONDITIONED
     _scale_into(A.V[ws.MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[ws.MINUS, slot] = 0.0
@@ -278,7 +277,7 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
 def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     n = A.C[ws.COUNT]
     b, q = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    inverse.multiply(A, b, q)
+    forms.multiply(A, b, q)
     noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
     _keep_for_undo(A, n, ws.UNDO_APPEND)
@@ -312,13 +311,13 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
     n = A.C[ws.COUNT]
     column, half = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    place = cholesky.position_of(A, slot)
+    place = forms.position_of(A, slot)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
     for i in range(place):
         half[i] = column[A.order[i]]
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
-    cholesky.delete(A, place, half)
+    forms.delete(A, place, half)
     noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n - 1)
     good = s > ws.SCHUR_SHARE * noise
@@ -326,7 +325,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
         A.C[ws.COUNT] = n
         _write_sample(A, slot, x, y, w)
         A.C[ws.COUNT] = n - 1
-        cholesky.add(A, slot, half, np.sqrt(s))
+        forms.add(A, slot, half, np.sqrt(s))
         good = finish(A)
     if not good:
         A.C[ws.COUNT] = n
@@ -338,7 +337,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
 @compiled_reassociating
 def _restore_replaced_cholesky(A: WindowArrays) -> None:
     """The window as it was before the sample of UNDO_SLOT was replaced, to the last bit. COUNT is what it was."""
-    cholesky.restore_factor(A)
+    forms.restore_factor(A)
     _restore_solution(A)
     _restore_sample(A)
 
@@ -347,16 +346,16 @@ def _restore_replaced_cholesky(A: WindowArrays) -> None:
 def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     n = A.C[ws.COUNT]
     half = A.V[ws.TRIAL]
-    cholesky.gather(A, A.V[ws.COLUMN], half)
-    cholesky.forward(A, half)
+    forms.gather(A, A.V[ws.COLUMN], half)
+    forms.forward(A, half)
     noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n)
     if not s > ws.SCHUR_SHARE * noise:
         return ws.ILL_CONDITIONED
     _keep_for_undo(A, n, ws.UNDO_APPEND)
     _write_sample(A, n, x, y, w)
-    cholesky.append_row(A, half)
-    cholesky.add(A, n, half, np.sqrt(s))
+    forms.append_row(A, half)
+    forms.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)
         return ws.ILL_CONDITIONED
@@ -413,13 +412,13 @@ def resum(A: WindowArrays) -> bool:
     for j in range(n):
         ones[j] = 1.0
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        inverse.solve(A, ones, A.S)
-        inverse.solve(A, A.V[ws.Y], A.V[ws.SY])
+        forms.solve(A, ones, A.S)
+        forms.solve(A, A.V[ws.Y], A.V[ws.SY])
     else:
-        cholesky.gather(A, ones, A.S)
-        cholesky.forward(A, A.S)
-        cholesky.gather(A, A.V[ws.Y], A.V[ws.SY])
-        cholesky.forward(A, A.V[ws.SY])
+        forms.gather(A, ones, A.S)
+        forms.forward(A, A.S)
+        forms.gather(A, A.V[ws.Y], A.V[ws.SY])
+        forms.forward(A, A.V[ws.SY])
     return finish(A)
 
 
@@ -429,12 +428,12 @@ def _refine_inverse(A: WindowArrays) -> bool:
     n, residual, z, sy = A.C[ws.COUNT], A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.SY]
     for i in range(n):
         residual[i] = 1.0 - dot(A.R[i], A.S, n)
-    inverse.solve(A, residual, z)
-    inverse.add_scaled(A.S, 1.0, z, n)
+    forms.solve(A, residual, z)
+    forms.add_scaled(A.S, 1.0, z, n)
     for i in range(n):
         residual[i] = A.V[ws.Y, i] - dot(A.R[i], sy, n)
-    inverse.solve(A, residual, z)
-    inverse.add_scaled(sy, 1.0, z, n)
+    forms.solve(A, residual, z)
+    forms.add_scaled(sy, 1.0, z, n)
     return finish(A)
 
 
@@ -444,11 +443,11 @@ def _refine_cholesky(A: WindowArrays) -> bool:
     n, good, t = A.C[ws.COUNT], resum(A), A.V[ws.MINUS]
     for i in range(n):
         t[i] = _row_residual(A, A.order[i])
-    cholesky.forward(A, t)
+    forms.forward(A, t)
     correction = _solve_bias(A, dot(A.S, t, n))
-    inverse.add_scaled(t, -correction, A.S, n)
+    forms.add_scaled(t, -correction, A.S, n)
     A.F[ws.BETA] += correction
-    cholesky.backward(A, t)
+    forms.backward(A, t)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] += t[i]
     return good and bool(np.isfinite(A.F[ws.BETA])) and finite(A.V[ws.ALPHA], n)
@@ -490,7 +489,7 @@ def take_back(A: WindowArrays) -> None:
     elif A.C[ws.FORM] == ws.INVERSE_FORM:
         _restore_solution(A)
         _restore_sample(A)
-        inverse.lower_column(A, slot, A.V[ws.PK])
+        forms.lower_column(A, slot, A.V[ws.PK])
     else:
         _restore_replaced_cholesky(A)
     if A.C[ws.FORM] == ws.INVERSE_FORM:
@@ -588,17 +587,17 @@ def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
     """
     n, root = A.C[ws.COUNT], A.F[ws.GRAM]
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        inverse.diagonal(A, out)
+        forms.inverse_diagonal(A, out)
         alpha, s = A.V[ws.ALPHA], A.S
         for i in range(n):
             half = s[i] / root if root > 0.0 else 0.0
             out[i] = _left_out(alpha[i], out[i], out[i] - half * half)
         return
-    cholesky.diagonal(A, out)
+    forms.cholesky_diagonal(A, out)
     t, factor = A.V[ws.TRIAL], 1.0 / root if root > 0.0 else 0.0
     for i in range(n):
         t[i] = factor * A.S[i]
-    cholesky.backward(A, t)
+    forms.backward(A, t)
     for i in range(n):
         slot = A.order[i]
         out[slot] = _left_out(A.V[ws.ALPHA, slot], out[slot], out[slot] - t[i] * t[i])

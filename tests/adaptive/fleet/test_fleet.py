@@ -9,8 +9,7 @@ import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
-from dehyst.adaptive.fleet.state import OUTCOMES
-from dehyst.adaptive.fleet.step import NO_SAMPLE
+from dehyst.adaptive.fleet.step import NO_SAMPLE, OUTCOMES
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.dead_reckoning import (
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.track import (
     CREEP_PER_S,
     LOST_SHARE,
     OFF_LINE,
@@ -19,7 +20,6 @@ from dehyst.adaptive.online.dead_reckoning import (
     answers,
     mean_slope,
 )
-from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.sim.stage.presets import preset

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.tuning import evidence
 from dehyst.adaptive.tuning import search as inference
@@ -90,7 +90,7 @@ def test_effective_parameters_by_eigenvalues() -> None:
     widths = np.array([0.5, 0.5, 0.5])
     found = evidence.evaluate(data, 30.0, widths)
     centre = np.eye(data.size) - 1.0 / data.size
-    eigenvalues = np.linalg.eigvalsh(centre @ kernels.gram(data.X, None, widths) @ centre)
+    eigenvalues = np.linalg.eigvalsh(centre @ features.gram(data.X, None, widths) @ centre)
     assert found.effective == pytest.approx(1 + np.sum(30 * eigenvalues / (1 + 30 * eigenvalues)), rel=1e-9)
 
 
@@ -183,13 +183,13 @@ def test_one_blas_thread_is_used_whatever_the_environment_says(called: str, monk
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
     seen: set[int] = set()
-    real, data, width = kernels.gram, small_problem(n=40), np.ones(3)
+    real, data, width = features.gram, small_problem(n=40), np.ones(3)
 
     def watched(*arguments: Any) -> Any:
         seen.update(threads())
         return real(*arguments)
 
-    monkeypatch.setattr(kernels, "gram", watched)
+    monkeypatch.setattr(features, "gram", watched)
     with threadpool_limits(2, "blas"):
         before = threads()
         if called == "infer":

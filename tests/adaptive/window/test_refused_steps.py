@@ -13,10 +13,9 @@ from dehyst.adaptive import lssvm
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import healing as window_refresh
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status
-from dehyst.adaptive.window.window import Form, Window, WindowConfig
+from dehyst.adaptive.window.window import Form, Window, WindowConfig, begin_refresh
 from tests.adaptive.window.windows import CAPACITY, GAMMA, WIDTHS, filled, forms, sample
 
 HELD = 12
@@ -66,7 +65,7 @@ def refused(window: Window) -> int:
 
 def refresh_around(window: Window, value: float) -> bool:
     """An extreme step while a refresh is open."""
-    refresh = window_refresh.begin(window)
+    refresh = begin_refresh(window)
     window.replace(1, POINT, value)
     refresh.factor()
     return refresh.finish()

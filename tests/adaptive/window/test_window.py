@@ -17,8 +17,7 @@ from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, handle_of
-from dehyst.adaptive.window.healing import begin
-from dehyst.adaptive.window.window import Form, SolverState, Window, WindowConfig
+from dehyst.adaptive.window.window import Form, SolverState, Window, WindowConfig, begin_refresh
 from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
 
 # --- The sliding window in both forms, against the direct solver and against itself.
@@ -345,7 +344,7 @@ def test_arrays_of_another_kind_are_refused() -> None:
 
 def test_after_a_refresh_the_new_arrays_answer() -> None:
     window, X, y = made()
-    refresh = begin(window)
+    refresh = begin_refresh(window)
     window.replace(7, X[71], float(y[71]))
     refresh.factor()
     assert refresh.finish()
