@@ -22,8 +22,8 @@ from numba.extending import get_cython_function_address
 from scipy.linalg import solve_triangular
 from threadpoolctl import ThreadpoolController
 
+from dehyst.adaptive import features
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.features import as_widths, gram
 from dehyst.adaptive.types import FloatArray
 
 # --- Factorisations that release the interpreter's lock while they run.
@@ -138,7 +138,7 @@ class LssvmModel:
         """Mean at the points ``X`` (M, d): (M,). Raises InputError on another number of features."""
         if X.ndim != 2 or X.shape[1] != self.X.shape[1]:
             raise InputError(f"X: got shape {X.shape}, expected (M, {self.X.shape[1]}), one row a point")
-        return np.asarray(gram(X, self.X, self.widths) @ self.alpha + self.bias, dtype=np.float64)
+        return np.asarray(features.gram(X, self.X, self.widths) @ self.alpha + self.bias, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,11 +181,11 @@ def fit(X: FloatArray, y: FloatArray, widths: object, gamma: float, weights: Flo
         raise InputError(f"X: got {n} samples, expected at least 2")
     if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y))):
         raise InputError("X, y: got values that are not finite, expected finite samples; drop those rows")
-    sigma, gamma = as_widths(widths, dimension), check_gamma(gamma)
+    sigma, gamma = features.as_widths(widths, dimension), check_gamma(gamma)
     w = np.ones(n) if weights is None else np.ascontiguousarray(weights, dtype=np.float64)
     if w.shape != (n,) or not np.all(np.isfinite(w)) or not np.all(w > 0):
         raise InputError(f"weights: got shape {w.shape}, expected ({n},) positive finite numbers, 1 for a plain sample")
-    L = gram(X, None, sigma)
+    L = features.gram(X, None, sigma)
     L[np.diag_indices(n)] += 1.0 / (gamma * w)
     cholesky_lower(L)
     L = np.tril(L)

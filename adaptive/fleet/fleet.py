@@ -259,7 +259,6 @@ class Fleet:
         s, c, w, share, none = self._state.rows, self._c, self._samples, self._threads.share, np.arange(0)
         share(0, steps.take, none, s, c, w)
         share(0, steps.teach, none, self._windows.predict(none), s, c, w)
-        self._windows.let_go(none)
         self._windows.learn(none, w)
         still = np.zeros((self.axes, 1))
         self.snapshot().feedforward(still, still, still, self.memory())
@@ -281,9 +280,7 @@ class Fleet:
         failed = axes[:0]
         if axes.size:
             share(axes.size, steps.teach, axes, self._windows.predict(axes), s, c, w)
-            fading, learning = axes[w["lets_go"][axes] & (outcome[axes] >= 0)], axes[w["learns"][axes]]
-            if fading.size:
-                self._windows.let_go(fading)
+            learning = axes[w["learns"][axes]]
             if learning.size:
                 status = self._windows.learn(learning, w)
                 learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)

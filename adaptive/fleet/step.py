@@ -25,7 +25,7 @@ from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import RestCreep, update
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, AdmissionState
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
-from dehyst.adaptive.online.kernel_window import NOWHERE, KernelShare
+from dehyst.adaptive.online.kernel_window import KernelShare
 from dehyst.adaptive.online.kernel_window import due as window_due
 from dehyst.adaptive.online.learner import MARK_S, REFERENCE_S, Judgement, Learner
 from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
@@ -331,10 +331,10 @@ _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
 
 
 #: A sample of an axis, and what is made of it. controls : whether the control trial of the axis may begin now.
-#: outcome : of the sample, or a number from above. lets_go, learns : steps that the window is to make, of target_V.
+#: outcome : of the sample, or a number from above. learns : whether the window is to make a step, of target_V.
 SAMPLE: Final = np.dtype([
     ("seq", np.int64), ("t_s", np.float64), ("u_V", np.float64), ("y_um", np.float64), ("present", np.bool_),
-    ("controls", np.bool_), ("outcome", np.int64), ("lets_go", np.bool_), ("learns", np.bool_),
+    ("controls", np.bool_), ("outcome", np.int64), ("learns", np.bool_),
     ("target_V", np.float64),
 ], align=True)  # fmt: skip
 
@@ -470,7 +470,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         u, before = r.front.track.smooth_V, s.voltages[b, (now - 1) % s.voltages.shape[1]]
         saturated = gates.check_pair(config.admission, s.voltages[b, at], before, motion[0]) != ""
         kept = s.numbers[b : b + 1].copy()
-        t["lets_go"] = t["learns"] = False
+        t["learns"] = False
         t["outcome"] = _SATURATED if saturated else _number_of(gates.PASSED)
         served, count = r.front.track.served, r.front.track.smoother.count
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
@@ -498,9 +498,6 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         if said == "outlier":
             t["outcome"] = _OUTLIER
             continue
-        if said == "burst":
-            r.window["changed"], r.window["next"] = r.window.clock, 0
-        t["lets_go"] = r.judgement.valid and r.window.next != NOWHERE
         if rests:
             shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
             served["offset_um"] += shift_um
@@ -627,15 +624,6 @@ def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed
         out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
 
 
-@compiled
-def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
-    """`ResidualWindow.let_go` of each axis."""
-    most = c.config[0].before_change
-    for k in range(lo, hi):
-        b = axes[k]
-        window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b])
-
-
 class CompiledWindows:
     """Windows of B axes, stepped by compiled code. ``axes`` (k,) are numbers of axes, without repeats."""
 
@@ -692,8 +680,3 @@ class CompiledWindows:
         out = np.empty(axes.size, dtype=np.int64)
         self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, w, out)
         return out
-
-    def let_go(self, axes: IntArray) -> None:
-        """`ResidualWindow.let_go` of each axis."""
-        self.write(axes.tolist())
-        self._threads.share(axes.size, let_go, self._handles, axes, self._rows, self._fixed)

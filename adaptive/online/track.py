@@ -46,35 +46,28 @@ STEPS, SLOPE_SHARE = 2, 1e-5
 SLOPES = (0.4, 25.0)
 #: Distance from the straight line through the start, in ranges, that hysteresis, creep and bend explain together.
 OFF_LINE = 0.35
-#: Most motion that a constant voltage causes (creep, drift), ranges per second.
-CREEP_PER_S = 0.1
-#: Readings before the doubtful one from which the model's error is taken.
-ANCHORS = 5
-#: Time constant with which the acceleration at the start is forgotten, s; time for which the stage's own motion at the
-#: start (lag, ringing) widens the band, s.
-FORGET_S, RUN_OUT_S = 0.05, 0.01
+#: Time for which the stage's own motion at the start (lag, ringing) widens the band, s.
+RUN_OUT_S = 0.01
 #: One standard deviation of the place, as a share of the way gone, and as a share of the range the most that this adds
 #: and the limit of what is of use.
 WAY_SHARE, WAY_MOST, LOST_SHARE = 0.002, 0.02, 0.05
 
 #: Entries of a reckoning's numbers.
-_Y, _V, _A, _U, _LOW, _HIGH, _WAY, _CUT, _OFF, _SLOPE, _LINE = range(11)
+_Y, _V, _U, _LOW, _HIGH, _WAY, _CUT, _OFF, _SLOPE, _LINE = range(10)
 
 
 @dataclass(slots=True)
 class Reckoning:
     """A reckoned place, and the fixed model that reckons it.
 
-    numbers : place (µm, µm/s, µm/s²) and voltage (V) of the last sample; the band (µm); way gone and what the band cut
+    numbers : place (µm, µm/s) and voltage (V) of the last sample; the band (µm); way gone and what the band cut
     off since the doubt began (µm); what a reading shows more than the place (µm); mean slope (V/µm), and the voltage
     at which the line through the start is at 0 µm (V).
     """
 
     model: Annotated[LssvmInverse, Entry("an immutable snapshot, which reckons the place")]
     memory: Annotated[FloatArray, Entry("hysteresis memory after the last sample", "µm", "m")]
-    numbers: Annotated[
-        FloatArray, Entry("as listed by `Reckoning`", "µm, µm/s, µm/s², V, µm, µm, µm, µm, µm, V/µm, V", "11")
-    ]
+    numbers: Annotated[FloatArray, Entry("as listed by `Reckoning`", "µm, µm/s, V, µm, µm, µm, µm, µm, V/µm, V", "10")]
 
     def check_state(self) -> None:
         """Raise ValueError where the memory is not of the model."""
@@ -95,10 +88,10 @@ class Reckoning:
 
         ``motion`` (µm, µm/s, µm/s²) and ``memory`` (m,) are of that instant, ``u_before_V`` is its voltage.
         """
-        y, v, a = motion
-        made = cls(model, memory.copy(), np.zeros(11))
+        y, v, _ = motion
+        made = cls(model, memory.copy(), np.zeros(10))
         slack = abs(v) * RUN_OUT_S + 1e-3 * made.range_um
-        made.numbers[:_WAY] = (y, v, a, u_before_V, y - slack, y + slack)
+        made.numbers[:_WAY] = (y, v, u_before_V, y - slack, y + slack)
         slope = mean_slope(model)
         made.numbers[[_SLOPE, _LINE]] = slope, u_before_V - slope * y
         # The first step is the model's way from the measured place to its own.
@@ -106,8 +99,8 @@ class Reckoning:
         for u in u_V[y_um.size :]:
             made.advance(float(u))
         if off.size:
-            # The middle one of the last: some of these readings may have rung, or been wrong, already.
-            made.numbers[_OFF] = float(np.median((y_um - off)[-ANCHORS:]))
+            # The middle one: some of these readings may have rung, or been wrong, already.
+            made.numbers[_OFF] = float(np.median(y_um - off))
         made.begin_way()
         return made
 
@@ -165,7 +158,7 @@ class Reckoning:
         f, n = self.model.features, self.numbers.copy()
         slope = frame.gain / f.gain
         n[[_Y, _LOW, _HIGH]] = frame.offset_um + slope * (n[[_Y, _LOW, _HIGH]] - f.offset_um)
-        n[[_V, _A, _WAY, _CUT, _OFF]] *= slope
+        n[[_V, _WAY, _CUT, _OFF]] *= slope
         n[_SLOPE] /= slope
         line_um = (n[_U] - n[_LINE]) / self.numbers[_SLOPE]
         n[_LINE] = n[_U] - n[_SLOPE] * (frame.offset_um + slope * (line_um - f.offset_um))
@@ -236,8 +229,8 @@ def _step(
     dv = 1e-3 / (m.scale[2] * m.frame[1])
     # How the voltage depends on velocity here decides where the velocity comes from.
     lag = (
-        voltage_of(before, v + dv, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
-        - voltage_of(before, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        voltage_of(before, v + dv, 0.0, memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        - voltage_of(before, v, 0.0, memory, scratch, m, beta, scaled, alpha, inverse_widths)
     ) / dv
     implicit = sign * lag > 0.0
     du = u - n[_U]
@@ -246,14 +239,14 @@ def _step(
     for _ in range(STEPS):
         if implicit:
             v = (y - before) / dt
-        there = voltage_of(y, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
-        more = voltage_of(y + h, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        there = voltage_of(y, v, 0.0, memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        more = voltage_of(y + h, v, 0.0, memory, scratch, m, beta, scaled, alpha, inverse_widths)
         slope = sign * min(max(sign * (more - there) / h, least), most)
         if implicit:
             slope += lag / dt
         else:
             v = du / (slope * dt)
-            there = voltage_of(y, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+            there = voltage_of(y, v, 0.0, memory, scratch, m, beta, scaled, alpha, inverse_widths)
         y -= (there - u) / slope
     # The band: the least and the largest motion that this change of the voltage can cause.
     rises, falls = max(sign * du, 0.0), min(sign * du, 0.0)
@@ -266,12 +259,10 @@ def _step(
     # What is cut off stays the same error while the stage stands still: the largest of it, not the sum.
     n[_CUT] = max(n[_CUT], abs(held - y) if math.isfinite(y) else span)
     if not anew:
-        # A voltage that rises moves the stage one way only, apart from the motion under way and from creep.
-        creep = CREEP_PER_S * span * dt
-        down, up = falls / least + min(under_way, -creep), rises / least + max(under_way, creep)
+        # A voltage that rises moves the stage one way only, apart from the motion under way.
+        down, up = falls / least + min(under_way, 0.0), rises / least + max(under_way, 0.0)
         held = min(max(held, before + down), before + up)
     n[_V] = (held - before) / dt
-    n[_A] *= math.exp(-dt / FORGET_S)
     n[_WAY] += abs(held - before)
     n[_Y], n[_U] = held, u
     advance(held, memory, m)
