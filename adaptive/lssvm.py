@@ -1,9 +1,9 @@
 """The least-squares support vector machine and its direct solver, the oracle for the recursive window.
 
-The dual system (2.27), with a noise weight w_i for each sample:
+The dual system (2.27):
 
-    y = b + K alpha,      [ 0   1'                          ] [  b  ]   [0]
-                          [ 1   Omega + diag(1/(gamma w_i)) ] [alpha] = [y]
+    y = b + K alpha,      [ 0   1'              ] [  b  ]   [0]
+                          [ 1   Omega + 1/gamma ] [alpha] = [y]
 
 With R the lower right block and P = R^-1: S = P 1, Sy = P y, b = 1'Sy/(1'S) (2.29), alpha = Sy - b S.
 """
@@ -125,7 +125,7 @@ class LssvmModel:
     Attributes
     ----------
     X : (N, d) support vectors.  alpha : (N,) dual weights.  bias : b.  widths : (d,) kernel widths sigma.
-    scale : variance of the kernel process, 1/mu of (2.33); that of the noise of a sample of weight 1 is scale/gamma.
+    scale : variance of the kernel process, 1/mu of (2.33); that of the noise is scale/gamma.
     """
 
     X: FloatArray
@@ -159,18 +159,17 @@ class LssvmFit:
 
 
 @one_thread
-def fit(X: FloatArray, y: FloatArray, widths: object, gamma: float, weights: FloatArray | None = None) -> LssvmFit:
+def fit(X: FloatArray, y: FloatArray, widths: object, gamma: float) -> LssvmFit:
     """Solve (2.27) by one Cholesky factorisation.
 
     Parameters
     ----------
     X : (N, d) normalised features.  y : (N,) normalised targets.
     widths : kernel width sigma, one for all or (d,).  gamma : regularisation, > 0.
-    weights : (N,) positive noise weights, all 1 if not given; a doubtful sample has less than 1.
 
     Raises
     ------
-    InputError : shapes, non-finite samples, weights or hyper-parameters out of range.
+    InputError : shapes, non-finite samples or hyper-parameters out of range.
     NumericsError : R is singular in double precision.
     """
     X, y = np.ascontiguousarray(X, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
@@ -182,11 +181,8 @@ def fit(X: FloatArray, y: FloatArray, widths: object, gamma: float, weights: Flo
     if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y))):
         raise InputError("X, y: got values that are not finite, expected finite samples; drop those rows")
     sigma, gamma = features.as_widths(widths, dimension), check_gamma(gamma)
-    w = np.ones(n) if weights is None else np.ascontiguousarray(weights, dtype=np.float64)
-    if w.shape != (n,) or not np.all(np.isfinite(w)) or not np.all(w > 0):
-        raise InputError(f"weights: got shape {w.shape}, expected ({n},) positive finite numbers, 1 for a plain sample")
     L = features.gram(X, None, sigma)
-    L[np.diag_indices(n)] += 1.0 / (gamma * w)
+    L[np.diag_indices(n)] += 1.0 / gamma
     cholesky_lower(L)
     L = np.tril(L)
     half = solve_triangular(L, np.column_stack([np.ones(n), y]), lower=True, check_finite=False)

@@ -93,11 +93,11 @@ def learn(A: WindowArrays, share: KernelShare, x: FloatArray, target_V: float, b
     room = n < A.S.shape[0] and value < SAME
     if room:
         slot = n
-        status = steps.append(A, x, target_V, 1.0)
+        status = steps.append(A, x, target_V)
     else:
         if fifo:
             slot = int(np.argmin(born[:n]))
-        status = steps.replace(A, slot, x, target_V, 1.0)
+        status = steps.replace(A, slot, x, target_V)
     if status == ws.ACCEPTED:
         born[slot] = share.clock
     return int(status)
@@ -248,7 +248,7 @@ class ResidualWindow:
         """A copy of samples and hyper-parameters."""
         window, n = self._window, len(self._window)
         age = (self._share.clock - self._born[:n]).astype(np.float64)
-        return WindowData(window.X, window.y, window.weights, age, self.hyper)
+        return WindowData(window.X, window.y, age, self.hyper)
 
     def newest(self, count: int) -> FloatArray:
         """(m, d) kernel inputs of the newest samples, m <= count, newest first."""

@@ -26,7 +26,7 @@ class WindowArrays(NamedTuple):
 
     P : (N, N). Inverse form: the lower triangle is R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS
         and PLUS of V). Cholesky form: L with R = L L', in the order of ``order``; L[i, j] is P[order[j], i - j].
-    R : (N, N) Omega + diag(1/(gamma w)), both triangles.
+    R : (N, N) Omega + 1/gamma, both triangles.
     X : (d, N) features.  scaled : (d, N) features divided by their widths.  inverse_widths : (d,).
     S : (N,) P 1; in the Cholesky form L^-1 1, by position.
     V : (ROWS, N) vectors.  U : (UNDO_ROWS, max(N, 1 + d)) what a refused step restores.  F : floats.  C : counters.
@@ -50,18 +50,18 @@ class WindowArrays(NamedTuple):
     kept: FloatArray
 
 
-# Rows of V. Y: targets. W: noise weights. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
+# Rows of V. Y: targets. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
 # PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. The others are scratch.
-Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K = range(12)
-ROWS = 12
+Y, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K = range(11)
+ROWS = 11
 
 # Rows of U. UNDO_POINT: beta, then the features of the slot.
 UNDO_S, UNDO_SY, UNDO_ALPHA, UNDO_R, UNDO_POINT = range(5)
 UNDO_ROWS = 5
 
 # Elements of F. BETA: the bias b of (2.29). GRAM: square root of 1'P 1.
-GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, BETA, GRAM = range(9)
-FLOATS = 9
+GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, TOLERANCE, BETA, GRAM = range(8)
+FLOATS = 8
 
 # Elements of C. UNDO: kind of the step that can be taken back.
 (
@@ -91,14 +91,14 @@ EVENTS = slice(STEPS, COUNTERS)
 
 #: Largest size of a feature or a target that is taken. They are normalised, of order 1.
 MOST = 1e9
-#: Range of gamma w, one over a sample's noise variance. Outside, double precision cannot tell noise from kernel.
+#: Range of gamma, one over a sample's noise variance. Outside, double precision cannot tell noise from kernel.
 LEAST_PRECISION, MOST_PRECISION = 1e-15, 1e15
 
 #: A refinement that leaves more than this share of the residual that called for it shows a wrong factorisation ...
 CONTRACTION = 0.5
 #: ... unless the residual is below this share of target and weights: then it is rounding.
 NEGLIGIBLE = 1e-13
-#: The Schur complement of a new sample is at least its noise variance 1/(gamma w). Below this share of it, P is wrong.
+#: The Schur complement of a new sample is at least its noise variance 1/gamma. Below this share of it, P is wrong.
 SCHUR_SHARE = 0.5
 #: Where a sample alone determines the bias, no more than this share of its diagonal element is left.
 UNDETERMINED = 1e-13
@@ -116,7 +116,7 @@ class Status(IntEnum):
     """Result of a step of the window. After all but ACCEPTED the window is as it was before."""
 
     ACCEPTED = 0
-    #: A value that is not finite or larger than MOST, a weight that is not positive or whose noise is out of range.
+    #: A value that is not finite or larger than MOST.
     BAD_INPUT = 1
     #: The step would have left the finite numbers or lost positive definiteness.
     ILL_CONDITIONED = 2

@@ -1,8 +1,8 @@
-"""The steps of the sliding window, compiled: its prediction, and one sample in, out, or with another weight.
+"""The steps of the sliding window, compiled: its prediction, and one sample in or out.
 
 Replacing slot k in the inverse form, with the kernel column b of the new sample (b_k := 0) and p = P e_k:
 
-    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/(gamma w) - b'q,  q_k := -1,
+    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/gamma - b'q,  q_k := -1,
     P <- P - p p'/p_kk + q q'/s.
 
 S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and alpha = Sy - b S. The Cholesky form is
@@ -78,34 +78,26 @@ def scale(A: WindowArrays) -> float:
 
 
 @compiled_reassociating
-def _acceptable_weight(A: WindowArrays, w: float) -> bool:
-    """True where double precision can tell the sample's noise variance 1/(gamma w) from the kernel."""
-    precision: float = A.F[ws.GAMMA] * w
-    return precision >= ws.LEAST_PRECISION and precision <= ws.MOST_PRECISION
-
-
-@compiled_reassociating
-def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
-    """Features and target finite and at most MOST, a weight as above."""
-    good = abs(y) <= ws.MOST and _acceptable_weight(A, w)
+def acceptable(A: WindowArrays, x: FloatArray, y: float) -> bool:
+    """Features and target finite and at most MOST."""
+    good = abs(y) <= ws.MOST
     for j in range(x.shape[0]):
         good = good and abs(x[j]) <= ws.MOST
     return good
 
 
 @compiled_reassociating
-def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
+def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float) -> None:
     """Put a sample into a slot, and its kernel column (in COLUMN, but for the slot's own element) into R."""
     column, row, n = A.V[ws.COLUMN], A.R[slot], A.C[ws.COUNT]
     for j in range(n):
         row[j] = column[j]
         A.R[j, slot] = column[j]
-    A.R[slot, slot] = 1.0 + 1.0 / (A.F[ws.GAMMA] * w)
+    A.R[slot, slot] = 1.0 + 1.0 / A.F[ws.GAMMA]
     for i in range(x.shape[0]):
         A.X[i, slot] = x[i]
         A.scaled[i, slot] = x[i] * A.inverse_widths[i]
     A.V[ws.Y, slot] = y
-    A.V[ws.W, slot] = w
 
 
 @compiled_reassociating
@@ -120,7 +112,6 @@ def _keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
     for i in range(A.X.shape[0]):
         A.U[ws.UNDO_POINT, 1 + i] = A.X[i, slot]
     A.F[ws.UNDO_Y] = A.V[ws.Y, slot]
-    A.F[ws.UNDO_W] = A.V[ws.W, slot]
     A.C[ws.UNDO] = kind
     A.C[ws.UNDO_SLOT] = slot
 
@@ -148,7 +139,6 @@ def _restore_sample(A: WindowArrays) -> None:
         A.X[i, slot] = A.U[ws.UNDO_POINT, 1 + i]
         A.scaled[i, slot] = A.X[i, slot] * A.inverse_widths[i]
     A.V[ws.Y, slot] = A.F[ws.UNDO_Y]
-    A.V[ws.W, slot] = A.F[ws.UNDO_W]
 
 
 # --- The solution (2.29) from S and Sy.
@@ -238,7 +228,7 @@ def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
 
 
 @compiled_reassociating
-def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     b, z, p, q = A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.PK], A.V[ws.TRIAL]
     b[slot] = 0.0
@@ -250,14 +240,14 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
     for j in range(n):
         q[j] = z[j] - factor * p[j]
     q[slot] = 0.0
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(b, q, n)
     # What P gains and loses on its diagonal bounds what it does elsewhere.
     good = pkk > 0.0 and s > ws.SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
     if good:
         q[slot] = -1.0
         _take_out_inverse(A, slot, p)
-        _write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y)
         _take_in_inverse(A, q, s)
         good = finish(A)
     if not good:
@@ -274,11 +264,11 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
 
 
 @compiled_reassociating
-def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+def _append_inverse(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     b, q = A.V[ws.COLUMN], A.V[ws.TRIAL]
     forms.multiply(A, b, q)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(b, q, n)
     _keep_for_undo(A, n, ws.UNDO_APPEND)
     good = s > ws.SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
@@ -288,7 +278,7 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         A.V[ws.SY, n] = 0.0
         for j in range(n + 1):
             A.P[n, j] = 0.0
-        _write_sample(A, n, x, y, w)
+        _write_sample(A, n, x, y)
         A.C[ws.COUNT] = n + 1
         _take_in_inverse(A, q, s)
         good = finish(A)
@@ -308,7 +298,7 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 
 @compiled_reassociating
-def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     column, half = A.V[ws.COLUMN], A.V[ws.TRIAL]
     place = forms.position_of(A, slot)
@@ -318,12 +308,12 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
     forms.delete(A, place, half)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n - 1)
     good = s > ws.SCHUR_SHARE * noise
     if good:
         A.C[ws.COUNT] = n
-        _write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y)
         A.C[ws.COUNT] = n - 1
         forms.add(A, slot, half, np.sqrt(s))
         good = finish(A)
@@ -343,17 +333,17 @@ def _restore_replaced_cholesky(A: WindowArrays) -> None:
 
 
 @compiled_reassociating
-def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+def _append_cholesky(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     half = A.V[ws.TRIAL]
     forms.gather(A, A.V[ws.COLUMN], half)
     forms.forward(A, half)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n)
     if not s > ws.SCHUR_SHARE * noise:
         return ws.ILL_CONDITIONED
     _keep_for_undo(A, n, ws.UNDO_APPEND)
-    _write_sample(A, n, x, y, w)
+    _write_sample(A, n, x, y)
     forms.append_row(A, half)
     forms.add(A, n, half, np.sqrt(s))
     if not finish(A):
@@ -522,58 +512,40 @@ def _checked(A: WindowArrays, status: int) -> int:
 
 
 @compiled_reassociating
-def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    """The sample in ``slot`` makes way for (x, y) of noise weight w. O(N²).
+def replace(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
+    """The sample in ``slot`` makes way for (x, y). O(N²).
 
     Checks one rotating row's residual afterwards and refines where it exceeds the tolerance.
     """
-    if not acceptable(A, x, y, w):
+    if not acceptable(A, x, y):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
     if slot < 0 or slot >= A.C[ws.COUNT]:
         return ws.NO_SLOT
     _kernel_column(A, x, A.V[ws.COLUMN])
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        status = _checked(A, _replace_inverse(A, slot, x, y, w))
+        status = _checked(A, _replace_inverse(A, slot, x, y))
     else:
-        status = _checked(A, _replace_cholesky(A, slot, x, y, w))
+        status = _checked(A, _replace_cholesky(A, slot, x, y))
     A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
 
 
 @compiled_reassociating
-def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    """One more slot, for (x, y) of noise weight w. O(N²)."""
-    if not acceptable(A, x, y, w):
+def append(A: WindowArrays, x: FloatArray, y: float) -> int:
+    """One more slot, for (x, y). O(N²)."""
+    if not acceptable(A, x, y):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
     if A.C[ws.COUNT] >= A.P.shape[0]:
         return ws.NO_SLOT
     _kernel_column(A, x, A.V[ws.COLUMN])
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        status = _checked(A, _append_inverse(A, x, y, w))
+        status = _checked(A, _append_inverse(A, x, y))
     else:
-        status = _checked(A, _append_cholesky(A, x, y, w))
+        status = _checked(A, _append_cholesky(A, x, y))
     A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
-
-
-@compiled_reassociating
-def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Give the sample in ``slot`` the noise weight w: out and in again, which is exact for any change. O(N²)."""
-    if slot < 0 or slot >= A.C[ws.COUNT]:
-        return ws.NO_SLOT
-    if not _acceptable_weight(A, w):
-        A.C[ws.BAD_INPUTS] += 1
-        return ws.BAD_INPUT
-    x = A.point
-    for i in range(x.shape[0]):
-        x[i] = A.X[i, slot]
-    for j in range(A.C[ws.COUNT]):
-        A.V[ws.COLUMN, j] = A.R[slot, j]
-    if A.C[ws.FORM] == ws.INVERSE_FORM:
-        return _checked(A, _replace_inverse(A, slot, x, A.V[ws.Y, slot], w))
-    return _checked(A, _replace_cholesky(A, slot, x, A.V[ws.Y, slot], w))
 
 
 # --- Leave-one-out.

@@ -59,7 +59,7 @@ class WindowConfig:
     ----------
     capacity : N, the number of slots.
     widths : kernel width of each of the d features, (2.31).
-    gamma : regularisation, > 0; the noise variance of sample i is 1/(gamma w_i) of the kernel's.
+    gamma : regularisation, > 0; the noise variance is 1/gamma of the kernel's.
     form : ``inverse`` is the fastest, its error grows with cond(R)²; ``cholesky`` takes about twice the time, its
         error grows with cond(R); ``auto`` takes the one that ``accuracy`` and the condition of the samples require,
         each time the window is made from samples or healed. An empty window starts as ``inverse``.
@@ -111,7 +111,7 @@ class SolverState:
     scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
     inverse_widths: Annotated[FloatArray, Entry("one over the widths", "", "d", low=1e-100)]
     S: Annotated[FloatArray, Entry("P 1, or L^-1 1 by position", "", "N")]
-    V: Annotated[FloatArray, Entry("targets, noise weights, dual weights and other vectors", "V", f"{ws.ROWS},N")]
+    V: Annotated[FloatArray, Entry("targets, dual weights and other vectors", "V", f"{ws.ROWS},N")]
     U: Annotated[FloatArray, Entry("what a refused step restores", "", f"{ws.UNDO_ROWS},room")]
     F: Annotated[FloatArray, Entry("regularisation, residuals, bias", "", f"{ws.FLOATS}")]
     C: Annotated[IntArray, Entry("counters", "", f"{ws.COUNTERS}", low=-1)]
@@ -158,9 +158,7 @@ class Window:
         return Window, (self.config, self._arrays)
 
     @classmethod
-    def from_samples(
-        cls, config: WindowConfig, X: FloatArray, y: FloatArray, weights: FloatArray | None = None
-    ) -> Window:
+    def from_samples(cls, config: WindowConfig, X: FloatArray, y: FloatArray) -> Window:
         """A window that holds the samples ``X`` (n, d), ``y`` (n,), n <= N, solved by one factorisation.
 
         Raises
@@ -169,29 +167,25 @@ class Window:
         NumericsError : their kernel matrix is singular in double precision.
         """
         X, y = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        w = np.ones(y.shape) if weights is None else np.asarray(weights, dtype=np.float64)
         n = y.size
-        if X.shape != (n, config.dimension) or y.shape != (n,) or w.shape != (n,) or not 0 < n <= config.capacity:
+        if X.shape != (n, config.dimension) or y.shape != (n,) or not 0 < n <= config.capacity:
             raise InputError(
-                f"X, y, weights: got shapes {X.shape}, {y.shape}, {w.shape}, expected (n, {config.dimension}), (n,), "
-                f"(n,) with 1 <= n <= {config.capacity}, the capacity"
+                f"X, y: got shapes {X.shape}, {y.shape}, expected (n, {config.dimension}), (n,) with "
+                f"1 <= n <= {config.capacity}, the capacity"
             )
-        precision = config.gamma * w
-        bounded = np.all(np.abs(X) <= ws.MOST) and np.all(np.abs(y) <= ws.MOST)
-        if not (bounded and np.all((precision >= ws.LEAST_PRECISION) & (precision <= ws.MOST_PRECISION))):
+        if not (np.all(np.abs(X) <= ws.MOST) and np.all(np.abs(y) <= ws.MOST)):
             raise InputError(
-                f"X, y, weights: got values that are not finite, larger than {ws.MOST:g}, or weights with gamma w "
-                f"outside {ws.LEAST_PRECISION:g} to {ws.MOST_PRECISION:g}; normalise them, and drop samples that are "
-                "not finite"
+                f"X, y: got values that are not finite or larger than {ws.MOST:g}; normalise them, and drop samples "
+                "that are not finite"
             )
         window = cls(config)
         A = window.arrays
         A.C[ws.COUNT] = n
         A.X[:, :n] = X.T
         A.scaled[:, :n] = X.T * A.inverse_widths[:, None]
-        A.V[ws.Y, :n], A.V[ws.W, :n] = y, w
+        A.V[ws.Y, :n] = y
         A.R[:n, :n] = features.gram(A.scaled[:, :n].T, None, np.ones(config.dimension))
-        A.R[np.arange(n), np.arange(n)] = 1.0 + 1.0 / (config.gamma * w)
+        A.R[np.arange(n), np.arange(n)] = 1.0 + 1.0 / config.gamma
         A.C[ws.FORM] = window.form_called_for()
         window.rebuild()
         return window
@@ -232,11 +226,6 @@ class Window:
         return self._arrays.V[ws.Y, : len(self)].copy()
 
     @property
-    def weights(self) -> FloatArray:
-        """Noise weights by slot, (n,), a copy."""
-        return self._arrays.V[ws.W, : len(self)].copy()
-
-    @property
     def alpha(self) -> FloatArray:
         """Dual weights by slot, (n,), a copy."""
         return self._arrays.V[ws.ALPHA, : len(self)].copy()
@@ -270,17 +259,13 @@ class Window:
 
     # --- steps ---------------------------------------------------------------------------------------------
 
-    def append(self, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+    def append(self, x: FloatArray, y: float) -> Status:
         """Take one more sample; ``x`` is (d,). NO_SLOT where the window is full."""
-        return Status(steps.append(self._arrays, self._point(x), float(y), float(weight)))
+        return Status(steps.append(self._arrays, self._point(x), float(y)))
 
-    def replace(self, slot: int, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+    def replace(self, slot: int, x: FloatArray, y: float) -> Status:
         """Put a new sample in place of the one in ``slot``; ``x`` is (d,). O(N²)."""
-        return Status(steps.replace(self._arrays, int(slot), self._point(x), float(y), float(weight)))
-
-    def reweight(self, slot: int, weight: float) -> Status:
-        """Change the noise weight of the sample in ``slot``: less than 1 for an old or doubtful one."""
-        return Status(steps.reweight(self._arrays, int(slot), float(weight)))
+        return Status(steps.replace(self._arrays, int(slot), self._point(x), float(y)))
 
     def _point(self, x: FloatArray) -> FloatArray:
         point = np.ascontiguousarray(x, dtype=np.float64)
@@ -349,7 +334,7 @@ class Window:
         n = len(self)
         if n == 0:
             return 1.0
-        return _largest_eigenvalue(self._arrays.R[:n, :n]) * self.config.gamma * float(np.max(self.weights))
+        return _largest_eigenvalue(self._arrays.R[:n, :n]) * self.config.gamma
 
     @property
     def round_residual(self) -> float:
@@ -374,7 +359,7 @@ class Window:
 
     def with_hyperparameters(self, widths: tuple[float, ...], gamma: float) -> Window:
         """A new window over the same samples with other hyper-parameters; its counters start at zero."""
-        return Window.from_samples(replace(self.config, widths=widths, gamma=gamma), self.X, self.y, self.weights)
+        return Window.from_samples(replace(self.config, widths=widths, gamma=gamma), self.X, self.y)
 
     def copy(self) -> Window:
         """An independent window in the same state, to the last bit."""
@@ -464,7 +449,6 @@ class HealingState:
     X: Annotated[FloatArray, Entry("features", "", "d,N")]
     scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
     y: Annotated[FloatArray, Entry("targets", "V", "N")]
-    w: Annotated[FloatArray, Entry("noise weights", "", "N")]
     count: Annotated[int, Entry("samples at its beginning", low=1)]
     form: Annotated[int, Entry("form of the window: 0 inverse, 1 Cholesky", low=0, high=1)]
     new_form: Annotated[int, Entry("form of the new factorisation", low=0, high=1)]
@@ -497,10 +481,9 @@ class Refresh:
         return self._factored
 
     def changed_slots(self) -> IntArray:
-        """Slots whose sample or weight differs from the copy's, in order."""
+        """Slots whose sample differs from the copy's, in order."""
         n, now, then = self._count, self._source.arrays, self._copy.arrays
-        differs = np.any(now.X[:, :n] != then.X[:, :n], axis=0) | (now.V[ws.W, :n] != then.V[ws.W, :n])
-        return np.flatnonzero(differs)
+        return np.flatnonzero(np.any(now.X[:, :n] != then.X[:, :n], axis=0))
 
     def finish(self) -> bool:
         """Bring the factored copy up to date and swap it in. The stepping thread.
@@ -512,12 +495,12 @@ class Refresh:
         n, source, copy = len(self._source), self._source.arrays, self._copy
         if not self._factored or source.C[ws.FORM] != self._form:
             return False
-        y, w = source.V[ws.Y], source.V[ws.W]
+        y = source.V[ws.Y]
         for slot in self.changed_slots():
-            if copy.replace(int(slot), np.ascontiguousarray(source.X[:, slot]), y[slot], w[slot]) != ws.ACCEPTED:
+            if copy.replace(int(slot), np.ascontiguousarray(source.X[:, slot]), y[slot]) != ws.ACCEPTED:
                 return False
         for slot in range(self._count, n):
-            if copy.append(np.ascontiguousarray(source.X[:, slot]), y[slot], w[slot]) != ws.ACCEPTED:
+            if copy.append(np.ascontiguousarray(source.X[:, slot]), y[slot]) != ws.ACCEPTED:
                 return False
         copy.arrays.V[ws.Y, :n] = y[:n]
         copy.arrays.C[ws.CURSOR :] = source.C[ws.CURSOR :]
@@ -533,8 +516,8 @@ class Refresh:
         """The input of the factorisation, as it was at the beginning. May be called while `factor` runs."""
         A = self._copy.arrays
         fields = {name: getattr(A, name).copy() for name in _FIELDS}
-        y, w = A.V[ws.Y].copy(), A.V[ws.W].copy()
-        return HealingState(left, **fields, y=y, w=w, count=self._count, form=self._form, new_form=int(A.C[ws.FORM]))
+        y = A.V[ws.Y].copy()
+        return HealingState(left, **fields, y=y, count=self._count, form=self._form, new_form=int(A.C[ws.FORM]))
 
     @classmethod
     def of(cls, window: Window, state: HealingState) -> Refresh:
@@ -543,7 +526,7 @@ class Refresh:
         A = made._copy.arrays
         for name in _FIELDS:
             getattr(A, name)[...] = getattr(state, name)
-        A.V[ws.Y], A.V[ws.W] = state.y, state.w
+        A.V[ws.Y] = state.y
         A.C[ws.COUNT] = made._count = state.count
         made._form = state.form
         return made
