@@ -431,9 +431,10 @@ def _largest_eigenvalue(R: FloatArray, iterations: int = 12) -> float:
 # it. A replay, a copy and a window restored from its state continue with the same numbers to the last bit.
 
 
-# --- A refresh costs O(N³), as much as some hundred steps. It has three parts: `begin` copies the state (stepping
-# thread, O(N²)), `Refresh.factor` factors the copy (any thread, without the interpreter's lock), `Refresh.finish`
-# applies the steps made meanwhile, one for each changed slot, and swaps the arrays in (stepping thread).
+# --- A refresh costs O(N³), as much as some hundred steps. It has three parts: `begin_refresh` copies the state
+# (stepping thread, O(N²)), `Refresh.factor` factors the copy (any thread, without the interpreter's lock),
+# `Refresh.finish` applies the steps made meanwhile, one for each changed slot, and swaps the arrays in (stepping
+# thread).
 
 
 #: Arrays that a factorisation reads and does not write.
