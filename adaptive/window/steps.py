@@ -6,7 +6,7 @@ Replacing slot k in the inverse form, with the kernel column b of the new sample
     P <- P - p p'/p_kk + q q'/s.
 
 S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and alpha = Sy - b S. The Cholesky form is
-described in `adaptive.window.forms`.
+described in `adaptive.window.arrays`.
 
 Every function takes the arrays of the window and returns a `Status` as int, or a number. Nothing allocates and nothing
 raises. A step that would leave the finite numbers is refused, counted and taken back: samples, alpha and bias are then
@@ -22,7 +22,6 @@ from dehyst.adaptive.compiled import compiled, compiled_reassociating, dot
 from dehyst.adaptive.features import rbf_column
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import forms
 from dehyst.adaptive.window.arrays import WindowArrays, arrays_of
 
 # --- The kernel column of a point, and what the window predicts there.
@@ -190,11 +189,11 @@ def finish(A: WindowArrays) -> bool:
     rest = A.V[ws.ALPHA] if inverse_form else A.V[ws.Z]
     for j in range(n):
         rest[j] = sy[j]
-    forms.add_scaled(rest, -A.F[ws.BETA], A.S, n)
+    ws.add_scaled(rest, -A.F[ws.BETA], A.S, n)
     good = good and bool(np.isfinite(A.F[ws.BETA])) and finite(rest, n)
     if inverse_form:
         return good
-    forms.backward(A, rest)
+    ws.backward(A, rest)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] = rest[i]
     return good and finite(rest, n)
@@ -213,9 +212,9 @@ def _scale_into(target: FloatArray, source: FloatArray, factor: float, n: int) -
 def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
     """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
     n = A.C[ws.COUNT]
-    forms.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
+    ws.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
     A.S[slot] = 0.0
-    forms.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
+    ws.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
     A.V[ws.SY, slot] = 0.0
 
 
@@ -223,8 +222,8 @@ def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
 def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
     n = A.C[ws.COUNT]
-    forms.add_scaled(A.S, _add_up(q, n) / s, q, n)
-    forms.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
+    ws.add_scaled(A.S, _add_up(q, n) / s, q, n)
+    ws.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
 
 
 @compiled_reassociating
@@ -232,9 +231,9 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int
     n = A.C[ws.COUNT]
     b, z, p, q = A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.PK], A.V[ws.TRIAL]
     b[slot] = 0.0
-    forms.multiply(A, b, z)
+    ws.multiply(A, b, z)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
-    forms.lift_column(A, slot, p)
+    ws.lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
@@ -254,7 +253,7 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int
         # _write_sample may not have run: restoring writes the same values again.
         _restore_solution(A)
         _restore_sample(A)
-        forms.lower_column(A, slot, p)
+        ws.lower_column(A, slot, p)
         return ws.ILL_CONDITIONED
     _scale_into(A.V[ws.MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[ws.MINUS, slot] = 0.0
@@ -267,7 +266,7 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int
 def _append_inverse(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     b, q = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    forms.multiply(A, b, q)
+    ws.multiply(A, b, q)
     noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(b, q, n)
     _keep_for_undo(A, n, ws.UNDO_APPEND)
@@ -301,13 +300,13 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float) -> int:
 def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     column, half = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    place = forms.position_of(A, slot)
+    place = ws.position_of(A, slot)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
     for i in range(place):
         half[i] = column[A.order[i]]
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
-    forms.delete(A, place, half)
+    ws.delete(A, place, half)
     noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n - 1)
     good = s > ws.SCHUR_SHARE * noise
@@ -315,7 +314,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float) -> in
         A.C[ws.COUNT] = n
         _write_sample(A, slot, x, y)
         A.C[ws.COUNT] = n - 1
-        forms.add(A, slot, half, np.sqrt(s))
+        ws.add(A, slot, half, np.sqrt(s))
         good = finish(A)
     if not good:
         A.C[ws.COUNT] = n
@@ -327,7 +326,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float) -> in
 @compiled_reassociating
 def _restore_replaced_cholesky(A: WindowArrays) -> None:
     """The window as it was before the sample of UNDO_SLOT was replaced, to the last bit. COUNT is what it was."""
-    forms.restore_factor(A)
+    ws.restore_factor(A)
     _restore_solution(A)
     _restore_sample(A)
 
@@ -336,16 +335,16 @@ def _restore_replaced_cholesky(A: WindowArrays) -> None:
 def _append_cholesky(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     half = A.V[ws.TRIAL]
-    forms.gather(A, A.V[ws.COLUMN], half)
-    forms.forward(A, half)
+    ws.gather(A, A.V[ws.COLUMN], half)
+    ws.forward(A, half)
     noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n)
     if not s > ws.SCHUR_SHARE * noise:
         return ws.ILL_CONDITIONED
     _keep_for_undo(A, n, ws.UNDO_APPEND)
     _write_sample(A, n, x, y)
-    forms.append_row(A, half)
-    forms.add(A, n, half, np.sqrt(s))
+    ws.append_row(A, half)
+    ws.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)
         return ws.ILL_CONDITIONED
@@ -402,13 +401,13 @@ def resum(A: WindowArrays) -> bool:
     for j in range(n):
         ones[j] = 1.0
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        forms.solve(A, ones, A.S)
-        forms.solve(A, A.V[ws.Y], A.V[ws.SY])
+        ws.solve(A, ones, A.S)
+        ws.solve(A, A.V[ws.Y], A.V[ws.SY])
     else:
-        forms.gather(A, ones, A.S)
-        forms.forward(A, A.S)
-        forms.gather(A, A.V[ws.Y], A.V[ws.SY])
-        forms.forward(A, A.V[ws.SY])
+        ws.gather(A, ones, A.S)
+        ws.forward(A, A.S)
+        ws.gather(A, A.V[ws.Y], A.V[ws.SY])
+        ws.forward(A, A.V[ws.SY])
     return finish(A)
 
 
@@ -418,12 +417,12 @@ def _refine_inverse(A: WindowArrays) -> bool:
     n, residual, z, sy = A.C[ws.COUNT], A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.SY]
     for i in range(n):
         residual[i] = 1.0 - dot(A.R[i], A.S, n)
-    forms.solve(A, residual, z)
-    forms.add_scaled(A.S, 1.0, z, n)
+    ws.solve(A, residual, z)
+    ws.add_scaled(A.S, 1.0, z, n)
     for i in range(n):
         residual[i] = A.V[ws.Y, i] - dot(A.R[i], sy, n)
-    forms.solve(A, residual, z)
-    forms.add_scaled(sy, 1.0, z, n)
+    ws.solve(A, residual, z)
+    ws.add_scaled(sy, 1.0, z, n)
     return finish(A)
 
 
@@ -433,11 +432,11 @@ def _refine_cholesky(A: WindowArrays) -> bool:
     n, good, t = A.C[ws.COUNT], resum(A), A.V[ws.MINUS]
     for i in range(n):
         t[i] = _row_residual(A, A.order[i])
-    forms.forward(A, t)
+    ws.forward(A, t)
     correction = _solve_bias(A, dot(A.S, t, n))
-    forms.add_scaled(t, -correction, A.S, n)
+    ws.add_scaled(t, -correction, A.S, n)
     A.F[ws.BETA] += correction
-    forms.backward(A, t)
+    ws.backward(A, t)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] += t[i]
     return good and bool(np.isfinite(A.F[ws.BETA])) and finite(A.V[ws.ALPHA], n)
@@ -479,7 +478,7 @@ def take_back(A: WindowArrays) -> None:
     elif A.C[ws.FORM] == ws.INVERSE_FORM:
         _restore_solution(A)
         _restore_sample(A)
-        forms.lower_column(A, slot, A.V[ws.PK])
+        ws.lower_column(A, slot, A.V[ws.PK])
     else:
         _restore_replaced_cholesky(A)
     if A.C[ws.FORM] == ws.INVERSE_FORM:
@@ -559,17 +558,17 @@ def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
     """
     n, root = A.C[ws.COUNT], A.F[ws.GRAM]
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        forms.inverse_diagonal(A, out)
+        ws.inverse_diagonal(A, out)
         alpha, s = A.V[ws.ALPHA], A.S
         for i in range(n):
             half = s[i] / root if root > 0.0 else 0.0
             out[i] = _left_out(alpha[i], out[i], out[i] - half * half)
         return
-    forms.cholesky_diagonal(A, out)
+    ws.cholesky_diagonal(A, out)
     t, factor = A.V[ws.TRIAL], 1.0 / root if root > 0.0 else 0.0
     for i in range(n):
         t[i] = factor * A.S[i]
-    forms.backward(A, t)
+    ws.backward(A, t)
     for i in range(n):
         slot = A.order[i]
         out[slot] = _left_out(A.V[ws.ALPHA, slot], out[slot], out[slot] - t[i] * t[i])

@@ -19,7 +19,7 @@ from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.state import Entry
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import forms, steps
+from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, WindowArrays
 
 # --- Configuration.
@@ -291,7 +291,7 @@ class Window:
         before = ws.duplicate(A)
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
             A.order[:n] = np.arange(n)
-            forms.take_upper(A, P)
+            ws.take_upper(A, P)
         else:
             A.P[:] = P
         A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
@@ -388,7 +388,7 @@ class Window:
             getattr(A, name)[...] = getattr(state, name)
         A.C[ws.UNDO] = ws.UNDO_NOTHING
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
-            forms.take_upper(A, A.P.copy())
+            ws.take_upper(A, A.P.copy())
         return window
 
 
@@ -400,7 +400,7 @@ def _matrices(A: ws.WindowArrays) -> dict[str, FloatArray]:
     """
     if A.C[ws.FORM] == ws.CHOLESKY_FORM:
         upper = np.zeros_like(A.P)
-        forms.write_upper(A, upper)
+        ws.write_upper(A, upper)
         return {"P": upper, "R": A.R.copy()}
     n = A.P.shape[0]
     packed = np.empty((n, n + 1))

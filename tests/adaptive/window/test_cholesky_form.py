@@ -9,7 +9,7 @@ from scipy.linalg import cho_factor
 from dehyst.adaptive import lssvm
 from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import forms, steps
+from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import KEPT_STEPS, Status
 from dehyst.adaptive.window.window import Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, STEPS, filled, sample
@@ -18,7 +18,7 @@ from tests.adaptive.window.windows import CAPACITY, STEPS, filled, sample
 def factor(window: Window) -> FloatArray:
     """(n, n) L."""
     upper = np.zeros((window.config.capacity, window.config.capacity))
-    forms.write_upper(window.arrays, upper)
+    ws.write_upper(window.arrays, upper)
     return upper[: len(window), : len(window)].T
 
 
