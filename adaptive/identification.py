@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive import lssvm
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.features import FeatureMap
+from dehyst.adaptive.features import FeatureMap, gram
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.smoothing import SmootherConfig, backward_difference, smooth_recording, zero_phase_lowpass
 from dehyst.adaptive.tuning import evidence
@@ -300,7 +300,7 @@ def identify_lssvm(
     gamma = hyper[0] if hyper else config.gamma
     widths = hyper[1] if hyper else np.full(features.kernel_size, config.width)
     trial = fit_model(features, basis[:split], kernel[:split], taught[:split], dt_s, config, gamma, widths)
-    predicted = basis @ trial.beta + kernels.gram(kernel, trial.support, widths) @ trial.alpha
+    predicted = basis @ trial.beta + gram(kernel, trial.support, widths) @ trial.alpha
     u_range, y_range = float(np.ptp(u)), float(np.ptp(y))
     errors = predicted - u
     rmse_V = float(np.sqrt(np.mean(errors[split:] ** 2)))

@@ -18,8 +18,7 @@ import numpy as np
 
 from dehyst.adaptive.compiled import all_finite, compiled, compiled_reassociating, dot, in_numpy
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.features import FeatureArrays, FeatureMap, advance, fill
-from dehyst.adaptive.kernels import rbf_column, weigh
+from dehyst.adaptive.features import FeatureArrays, FeatureMap, advance, fill, rbf_column, weigh
 from dehyst.adaptive.state import Entry, Kinded, load, save
 from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 

@@ -105,13 +105,12 @@ class WindowData:
     Attributes
     ----------
     kernel : (n, d) kernel inputs, dimensionless. targets_V : (n,) voltage less the linear part, V.
-    weights : (n,) noise weights. age : (n,) steps of the window since each sample was taken, 0 for the newest.
+    age : (n,) steps of the window since each sample was taken, 0 for the newest.
     hyper : the hyper-parameters that the window works with.
     """
 
     kernel: FloatArray
     targets_V: FloatArray
-    weights: FloatArray
     age: FloatArray
     hyper: Hyperparameters
 

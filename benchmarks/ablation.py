@@ -73,7 +73,7 @@ from dehyst.adaptive.online.drift import DriftConfig, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow
-from dehyst.adaptive.online.learner import Judgement, Parts
+from dehyst.adaptive.online.learner import Judgement
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.lab.rehearsal import (
     SENSOR,
@@ -335,9 +335,8 @@ RULES: Final = (
     Rule("validity", ((Judgement, "decide", _always(True)),)),
     Rule("doubt after a jump", ((Judgement, "add_doubt", _nothing),)),
     Rule("a sudden change is detected", ((drift, "DEAD_S", math.inf),)),
-    Rule("a jump opens the filter", ((Parts, "expect_change", _nothing),)),
+    Rule("a jump opens the filter", ((drift.DriftFilter, "expect_change", _nothing),)),
     Rule("outliers are refused by the filter", ((drift, "update", _ungated),)),
-    Rule("samples from before a change count less", ((ResidualWindow, "let_go", _nothing),)),
     Rule("the window learns", ((ResidualWindow, "learn", _always(LEARNT)),)),
     Rule("the kernel part", ((ResidualWindow, "predict", _always(0.0)), (ResidualWindow, "arrays", _no_kernel))),
     Rule("only the share that is borne out of the kernel part", ((ResidualWindow, "weigh", _nothing),)),

@@ -14,7 +14,7 @@ from scipy.linalg import blas
 from scipy.linalg.lapack import dpotrf, dpotrs
 from threadpoolctl import threadpool_limits
 
-from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.compiled import compiled, compiled_reassociating
 from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.warm import warm
@@ -133,7 +133,7 @@ class Slide:
 
 def refit(X: FloatArray, y: FloatArray) -> None:
     """The same solution from scratch: Gram matrix, factor, two solves."""
-    R = kernels.gram(X, None, np.full(DIMENSION, WIDTH))
+    R = features.gram(X, None, np.full(DIMENSION, WIDTH))
     R[np.diag_indices(y.size)] += 1.0 / GAMMA
     factor, _ = dpotrf(R, lower=1, overwrite_a=1)
     dpotrs(factor, np.column_stack([np.ones(y.size), y]), lower=1)
@@ -144,7 +144,7 @@ def bench_window(n: int, repeats: int) -> dict[str, float]:
     X, y = stream(n + 4 * repeats)
     update = Slide(X, y, n, "inverse")
     point = X[n].copy()
-    symmetric = np.asfortranarray(kernels.gram(X[:n], None, np.full(DIMENSION, WIDTH)))
+    symmetric = np.asfortranarray(features.gram(X[:n], None, np.full(DIMENSION, WIDTH)))
     vector, out = y[:n].copy(), np.zeros(n)
     triangle = np.ascontiguousarray(symmetric)
     measured = interleaved(

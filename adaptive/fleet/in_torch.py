@@ -15,16 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dehyst.adaptive.fleet import windows
-from dehyst.adaptive.fleet.state import Fixed, Rows
-from dehyst.adaptive.online.kernel_window import NOWHERE, SAME
+from dehyst.adaptive.fleet import step
+from dehyst.adaptive.fleet.step import Fixed, Rows
+from dehyst.adaptive.online.kernel_window import SAME
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window.arrays import ACCEPTED, WindowArrays
 
 
 class TorchWindows:
-    """Windows of B axes. See `adaptive.fleet.windows.CompiledWindows`."""
+    """Windows of B axes. See `adaptive.fleet.step.CompiledWindows`."""
 
     shares = False
     #: All matrices are written from the start; see `CompiledWindows.unwritten`.
@@ -94,31 +94,16 @@ class TorchWindows:
             nearest = self._to(np.where(held, s.born[axes], np.iinfo(np.int64).max).argmin(1))
         slots = torch.where(room, count, nearest)
         targets = self._to(w["target_V"][axes])
-        good = self._exchange(at, slots, points, targets, torch.ones_like(targets), column, True)
+        good = self._exchange(at, slots, points, targets, column)
         status = np.full(axes.size, ACCEPTED)
         done, slot = axes[good], slots.cpu().numpy()[good]
         turns["clock"][done] += 1
         s.born[done, slot] = turns["clock"][done]
         rest = ~good
         said = np.empty(int(rest.sum()), dtype=np.int64)
-        self._alone(axes[rest], windows.learn, w, said)
+        self._alone(axes[rest], step.learn, w, said)
         status[rest] = said
         return status
-
-    def let_go(self, axes: IntArray) -> None:
-        """`ResidualWindow.let_go` of each axis."""
-        s, r, slots = self._rows, self._rows.numbers["window"], np.arange(self._rows.born.shape[1])
-        most = float(self._fixed.config["before_change"][0])
-        held = self._to(axes)
-        old = (s.born[axes] <= r["changed"][axes, None]) & (slots >= r["next"][axes, None])
-        old &= self._all["V"][held, ws.W].cpu().numpy() > most
-        old &= slots < self._all["C"][held, ws.COUNT].cpu().numpy()[:, None]
-        found, slot = old.any(1), old.argmax(1)
-        r["next"][axes[~found]] = NOWHERE
-        at, slot = axes[found], slot[found]
-        good = self._reweight(at, slot, np.full(at.size, most))
-        r["next"][at[good]] = slot[good] + 1
-        self._alone(at[~good], windows.let_go)
 
     def _alone(self, axes: IntArray, work: Callable[..., None], *arguments: object) -> None:
         """Steps of some axes by the processor's compiled code, on copies that are taken over."""
@@ -129,15 +114,7 @@ class TorchWindows:
         for axis, arrays in copies.items():
             self.put(axis, arrays)
 
-    def _reweight(self, axes: IntArray, slots: IntArray, weights: FloatArray) -> Any:
-        """(k,) which of the samples in ``slots`` have got their weights."""
-        A, at, slot = self._all, self._to(axes), self._to(slots)
-        x, y = A["X"][at, :, slot], A["V"][at, ws.Y, slot]
-        return self._exchange(at, slot, x, y, self._to(weights), A["R"][at, slot], False)
-
-    def _exchange(
-        self, axes: Tensor, slot: Tensor, x: Tensor, y: Tensor, w: Tensor, column: Tensor, counted: bool
-    ) -> Any:
+    def _exchange(self, axes: Tensor, slot: Tensor, x: Tensor, y: Tensor, column: Tensor) -> Any:
         """A sample into ``slot`` of each axis, for the one there or as one more: `steps.replace` and ``append``.
 
         (k,) which of the steps are made; of the others nothing is.
@@ -151,8 +128,7 @@ class TorchWindows:
         C, F, V = A["C"][axes], A["F"][axes], A["V"][axes]
         gamma, count = F[:, ws.GAMMA], C[:, ws.COUNT]
         grown = torch.maximum(count, slot + 1)
-        precision = gamma * w
-        noise = 1.0 / precision
+        noise = 1.0 / gamma
         b = column.clone()
         b[k, slot] = 0.0
         p = P[k, slot].clone()
@@ -163,10 +139,9 @@ class TorchWindows:
         q[k, slot] = 0.0
         s = 1.0 + noise - (b * q).sum(1)
         good = (x.abs() <= ws.MOST).all(1) & (y.abs() <= ws.MOST) & (pkk > 0.0) & (s > ws.SCHUR_SHARE * noise)
-        good &= (precision >= ws.LEAST_PRECISION) & (precision <= ws.MOST_PRECISION)
         good &= torch.isfinite((p * p).sum(1) / pkk + (q * q).sum(1) / s)
         q[k, slot] = -1.0
-        V[k, ws.Y, slot], V[k, ws.W, slot] = y, w
+        V[k, ws.Y, slot] = y
         Y, ones = V[:, ws.Y], (self._slots < grown[:, None]).to(V.dtype)
         # P times 1 and P times y after the exchange, in O(N).
         before = torch.stack((A["S"][axes], V[:, ws.SY]))
@@ -197,7 +172,7 @@ class TorchWindows:
         F[:, ws.ROUND_WORST], F[:, ws.RESIDUAL] = torch.where(rotated, 0.0, worst), error
         F[:, ws.BETA], F[:, ws.GRAM] = beta, gram.sqrt()
         C[:, ws.COUNT], C[:, ws.CURSOR] = grown, torch.where(rotated, 0, cursor + 1)
-        C[:, ws.STEPS] += int(counted)
+        C[:, ws.STEPS] += 1
         C[:, ws.ROUNDS] += rotated
         V[:, ws.SY], V[:, ws.ALPHA] = SY, alpha
         done = good.nonzero()[:, 0]

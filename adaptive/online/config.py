@@ -32,7 +32,6 @@ class LearnerConfig:
     and invalid.
     fallback_floor : share of the voltage span by which the learner may be worse than the identified model.
     creep_s : time within which what the constant takes up at rest goes over to the frame; 0: it stays.
-    before_change : weight of samples of the window from before a detected change of the stage.
     envelope : what the stage can become.
     """
 
@@ -47,7 +46,6 @@ class LearnerConfig:
     valid_leave: float = 0.012
     fallback_floor: float = 0.002
     creep_s: float = 0.1
-    before_change: float = 0.05
     admission: AdmissionConfig = field(default_factory=AdmissionConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
@@ -66,8 +64,6 @@ class LearnerConfig:
             raise InputError(f"serving_age_s: got {self.serving_age_s}, expected 0 to 10 s")
         if not 0.0 <= self.creep_s <= 1e6:
             raise InputError(f"creep_s: got {self.creep_s}, expected a time in s, or 0 to leave the frame where it is")
-        if not 0.0 < self.before_change <= 1.0:
-            raise InputError(f"before_change: got {self.before_change}, expected a weight above 0, up to 1")
         if not 0.0 < self.valid_enter <= self.valid_leave:
             raise InputError(
                 f"valid_enter, valid_leave: got {self.valid_enter}, {self.valid_leave}, expected 0 < enter <= leave"

@@ -1,7 +1,7 @@
 """Classify readings far from the prediction: glitch, ringing after a shock, lasting jump, or sensor fault.
 
 From the first such reading on, samples are held and not learnt. Dead reckoning continues from the sample before it
-(``adaptive.online.dead_reckoning``). `judge` decides by the distances of the readings from the dead-reckoned position:
+(``adaptive.online.track``). `judge` decides by the distances of the readings from the dead-reckoned position:
 
 - back at the old level for ``CALM_S``: a glitch or a shock that is over;
 - ringing about the old level: motion of the stage; wait until it ends;
@@ -21,9 +21,8 @@ import numpy as np
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.features import FeatureMap
-from dehyst.adaptive.online.dead_reckoning import Reckoning
 from dehyst.adaptive.online.gates import AdmissionConfig, EnvelopeConfig
-from dehyst.adaptive.online.track import Step
+from dehyst.adaptive.online.track import Reckoning, Step
 from dehyst.adaptive.state import Entry
 from dehyst.adaptive.types import BoolArray, FloatArray
 

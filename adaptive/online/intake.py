@@ -26,12 +26,23 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online import glitch_or_jump as hypotheses
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
 from dehyst.adaptive.online.gates import AdmissionState
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
-from dehyst.adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
 from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following, Outcome, Trial
-from dehyst.adaptive.online.track import Pair, Past, Step, Taken, Track
+from dehyst.adaptive.online.track import (
+    PROBE_EVERY,
+    UNKNOWN_S,
+    MissingMotion,
+    Pair,
+    Past,
+    Reckoning,
+    Step,
+    Taken,
+    Track,
+    answers,
+    drive_V,
+    mean_slope,
+)
 from dehyst.adaptive.smoothing import smoother_of
 from dehyst.adaptive.state import Entry, restore, save
 from dehyst.adaptive.types import FloatArray, Sample

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from dehyst.adaptive import kernels
+from dehyst.adaptive import features
 from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
@@ -17,14 +17,11 @@ from dehyst.adaptive.types import FloatArray, Hyperparameters, IntArray, StateDi
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, WindowArrays
-from dehyst.adaptive.window.healing import Healing, HealingState
-from dehyst.adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
+from dehyst.adaptive.window.window import Healing, HealingState, SolverConfig, SolverState, Window, WindowConfig
 
 Eviction = Literal["nearest", "fifo"]
 #: A sample with a kernel value above this to a held one takes its slot even where there are free slots.
 SAME = 0.98
-#: No slot.
-NOWHERE = -1
 
 
 @shared
@@ -37,22 +34,13 @@ def due(updates: int, every: int) -> bool:
     return updates % every == (updates // every) % every
 
 
-@dataclass(slots=True)
-class Turn:
-    """Where the window is on its way through its slots."""
-
-    clock: Annotated[int, Entry("steps so far", low=0)] = 0
-    changed: Annotated[int, Entry("samples up to this step are from before the last change", low=0)] = 0
-    next: Annotated[int, Entry("slots from this on may hold some", low=NOWHERE)] = NOWHERE
-
-
 #: Time over which the share of the kernel part is taken, s: a stroke of a usual motion.
 SHARE_S = 0.5
 
 
 @dataclass(slots=True)
 class KernelShare:
-    """Share of the kernel part that recent measurements confirm: its least-squares factor, from 0 to 1.
+    """Steps so far, and the share of the kernel part that recent measurements confirm: its least-squares factor.
 
     The kernel part is local. Where it was learnt from another motion than the present one, it only disturbs the linear
     part, which then learns faster without it.
@@ -61,6 +49,7 @@ class KernelShare:
     product_V2: Annotated[float, Entry("mean product of the kernel part and what the linear part leaves", "V²")]
     square_V2: Annotated[float, Entry("mean square of the kernel part", "V²", low=0.0)]
     share: Annotated[float, Entry("share of the kernel part that is served", low=0.0, high=1.0)] = 1.0
+    clock: Annotated[int, Entry("steps so far", low=0)] = 0
 
     @shared
     def take(self, kernel_V: float, left_V: float, step_s: float) -> None:
@@ -77,17 +66,11 @@ class KernelState:
     """What a `ResidualWindow` holds beside the arrays of its solver."""
 
     born: Annotated[IntArray, Entry("step that each sample came with", "", "N")]
-    turn: Annotated[Turn, Entry("place in the window", name="")]
     share: Annotated[KernelShare, Entry("how much of the kernel part counts", name="")]
     kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)]
     gamma: Annotated[float, Entry("regularisation", low=0.0)]
     widths: Annotated[tuple[float, ...], Entry("kernel widths", "", "d", low=1e-100)]
     healing: Annotated[HealingState | None, Entry("a new factorisation on its way")]
-
-    def check_state(self) -> None:
-        """Raise ValueError where the next slot is none."""
-        if self.turn.next > self.born.size:
-            raise ValueError(f"next: got {self.turn.next}, expected at most {self.born.size}")
 
 
 @dataclass(slots=True)
@@ -102,34 +85,22 @@ _SOLVER = frozenset(row.name for row in rows(SolverState))
 
 
 @shared
-def learn(A: WindowArrays, turn: Turn, x: FloatArray, target_V: float, born: IntArray, fifo: bool) -> int:
+def learn(A: WindowArrays, share: KernelShare, x: FloatArray, target_V: float, born: IntArray, fifo: bool) -> int:
     """See `ResidualWindow.learn`: the status of the step. born (N,) : step that a sample came with."""
     n = A.C[ws.COUNT]
     slot, value = steps.nearest(A, x)
-    turn.clock += 1
+    share.clock += 1
     room = n < A.S.shape[0] and value < SAME
     if room:
         slot = n
-        status = steps.append(A, x, target_V, 1.0)
+        status = steps.append(A, x, target_V)
     else:
         if fifo:
             slot = int(np.argmin(born[:n]))
-        status = steps.replace(A, slot, x, target_V, 1.0)
+        status = steps.replace(A, slot, x, target_V)
     if status == ws.ACCEPTED:
-        born[slot] = turn.clock
+        born[slot] = share.clock
     return int(status)
-
-
-@shared
-def let_go(A: WindowArrays, turn: Turn, most: float, born: IntArray) -> None:
-    """See `ResidualWindow.let_go`."""
-    while 0 <= turn.next < A.C[ws.COUNT]:
-        slot = turn.next
-        turn.next += 1
-        if born[slot] <= turn.changed and A.V[ws.W, slot] > most:
-            steps.reweight(A, slot, most)
-            return
-    turn.next = NOWHERE
 
 
 class ResidualWindow:
@@ -156,7 +127,6 @@ class ResidualWindow:
         self._window = Window(self._config, arrays)
         self._healing = Healing(self._window)
         self._born = np.zeros(capacity, dtype=np.int64)
-        self._turn = Turn()
         self._share = KernelShare(0.0, 0.0)
 
     @classmethod
@@ -168,7 +138,7 @@ class ResidualWindow:
         n = model.support.shape[0]
         if n:
             # The targets follow from the solution: y = K alpha + alpha / gamma. Its bias is in the linear part.
-            targets = kernels.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
+            targets = features.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
@@ -249,31 +219,14 @@ class ResidualWindow:
         """Learn one sample. Returns "learnt", or "numerics" where the step was refused and undone.
 
         A numerical refusal starts the healing of the window. The same solution is served, and steps that fail are
-        refused, until a new factorisation is swapped in `adaptive.window.healing.STEPS` samples later.
+        refused, until a new factorisation is swapped in `adaptive.window.window.HEALING_STEPS` samples later.
         """
         self._healing.step()
         A, n, x = self._window.arrays, len(self._window), np.ascontiguousarray(kernel, dtype=np.float64)
-        status = learn(A, self._turn, x, float(target_V), self._born, self.eviction == "fifo")
+        status = learn(A, self._share, x, float(target_V), self._born, self.eviction == "fifo")
         if status == Status.ILL_CONDITIONED and n:
             self._healing.begin()
         return admission.LEARNT if status == Status.ACCEPTED else admission.NUMERICS
-
-    def expect_change(self) -> None:
-        """The stage has changed: mark all samples as from before the change. See `let_go`."""
-        self._turn.changed, self._turn.next = self._turn.clock, 0
-
-    def keep(self) -> None:
-        """There was no change: leave the remaining samples as they are."""
-        self._turn.next = NOWHERE
-
-    def let_go(self, most: float) -> None:
-        """Limit the weight of one sample from before the last change to ``most``, the next one at each call. A weight w
-        means 1/w times the noise variance.
-
-        Old samples are down-weighted, not removed: where nothing newer has come they are the best there are. One per
-        call, because 500 steps of the window at once would delay a sample.
-        """
-        let_go(self._window.arrays, self._turn, most, self._born)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V, of the share that is served. Copies."""
@@ -294,8 +247,8 @@ class ResidualWindow:
     def data(self) -> WindowData:
         """A copy of samples and hyper-parameters."""
         window, n = self._window, len(self._window)
-        age = (self._turn.clock - self._born[:n]).astype(np.float64)
-        return WindowData(window.X, window.y, window.weights, age, self.hyper)
+        age = (self._share.clock - self._born[:n]).astype(np.float64)
+        return WindowData(window.X, window.y, age, self.hyper)
 
     def newest(self, count: int) -> FloatArray:
         """(m, d) kernel inputs of the newest samples, m <= count, newest first."""
@@ -313,7 +266,7 @@ class ResidualWindow:
         """
         made = object.__new__(ResidualWindow)
         c = self._config
-        made.eviction, made._turn, made._born = self.eviction, replace(self._turn), self._born.copy()
+        made.eviction, made._born = self.eviction, self._born.copy()
         made._share = replace(self._share)
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
@@ -337,7 +290,7 @@ class ResidualWindow:
         """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
         c, healing = self._config, self._healing.state()
         kept = (
-            self._born.copy(), self._turn, self._share, self.kernel_variance, c.gamma, c.widths, healing,
+            self._born.copy(), self._share, self.kernel_variance, c.gamma, c.widths, healing,
         )  # fmt: skip
         return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
 
@@ -358,5 +311,5 @@ class ResidualWindow:
         solver = state.solver if isinstance(state, KernelSolverState) else None
         self._window = Window(self._config, kept) if solver is None else Window.of(self._config, solver)
         self._healing = Healing.of(self._window, state.healing)
-        self._born, self._turn, self._share = state.born, state.turn, state.share
+        self._born, self._share = state.born, state.share
         self.kernel_variance = state.kernel_variance

@@ -21,14 +21,12 @@ from dehyst.adaptive.features import ACCELERATION, VELOCITY, FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
 from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
 from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from dehyst.adaptive.online.glitch_or_jump import level_of
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import ResidualWindow, due
-from dehyst.adaptive.online.missing_motion import MissingMotion
-from dehyst.adaptive.online.track import Pair
+from dehyst.adaptive.online.track import MissingMotion, Pair, Reckoning, drive_V
 from dehyst.adaptive.state import Entry, Refused, restore, save, within
 from dehyst.adaptive.types import (
     FloatArray,
@@ -230,26 +228,16 @@ class Parts:
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
 
-    def expect_change(self) -> None:
-        """The stage has changed: the filter follows faster, and older samples of the window will count less."""
-        self.filter.expect_change()
-        self.window.expect_change()
-
     def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, rest: bool) -> bool:
         """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
         ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
         """
         left_V = pair.u_V - float(basis.dot(self.filter.beta))
-        said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest)
-        if said == "outlier":
+        if self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest) == "outlier":
             return False
         if not rest:
             self.window.weigh(kernel_V, left_V, self.filter.step_s)
-        if said == "burst":
-            self.window.expect_change()
-        if self.judgement.valid:
-            self.window.let_go(self.config.before_change)
         self.take_rest(pair.u_V, moving=not rest)
         if self.judgement.valid and not rest:
             self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
@@ -295,7 +283,6 @@ class Parts:
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
-        self.window.keep()
         self.events["distrusts"] += 1
 
     def take_jump(self, jump_um: float, first: bool) -> None:
@@ -435,8 +422,7 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     window.with_hyperparameters(window.hyper).newest_error_V(1)
     for moving in (True, False):
         parts.filter.update(basis, 0.0, moving)
-    parts.expect_change()
-    window.let_go(0.5)
+    parts.filter.expect_change()
 
 
 class Learner:
@@ -518,7 +504,7 @@ class Learner:
         if taken.jump_um:
             parts.take_jump(taken.jump_um, taken.first)
             if intake.track is not None and intake.track.features is intake.track.served:
-                parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
+                parts.filter.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
         moved = taken.jump_um or taken.distrusted or taken.renamed
         if moved or taken.refused == admission.GAP:
             self._cache = None
@@ -526,7 +512,7 @@ class Learner:
         for step in taken.steps:
             pair, switched = intake.advance(step)
             if switched:
-                parts.expect_change()
+                parts.filter.expect_change()
             if not taken.refused:
                 outcome = admission.SETTLING if pair is None else self.teach(pair)
         return outcome

@@ -36,8 +36,8 @@ import numpy as np
 
 from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.dead_reckoning import Reckoning, drive_V
 from dehyst.adaptive.online.glitch_or_jump import Circumstances, tolerance_um
+from dehyst.adaptive.online.track import Reckoning, drive_V
 from dehyst.adaptive.state import Entry
 from dehyst.adaptive.types import FloatArray
 

@@ -1,9 +1,9 @@
 """Three levels of Bayesian inference for the LSSVM, (2.33)-(2.36), with gradients and without eigenvectors.
 
 Level 1 gives beta and alpha, level 2 gamma, level 3 the kernel widths. In the notation of `adaptive.lssvm`, with
-D = diag(1/(gamma w)), Pc = P - S S'/G with G = 1'S, alpha = Pc y and 2 J1 = y'alpha:
+D = 1/gamma, Pc = P - S S'/G with G = 1'S, alpha = Pc y and 2 J1 = y'alpha:
 
-    E_D = ½ sum w_i e_i²,  e_i = alpha_i/(gamma w_i);   E_W = J1 - gamma E_D;   N - Geff = tr(Pc D)
+    E_D = ½ sum e_i²,  e_i = alpha_i/gamma;   E_W = J1 - gamma E_D;   N - Geff = tr(Pc D)
     mu = (Geff - 1)/(2 E_W),  zeta = (N - Geff)/(2 E_D)
     J2 = log|R| + log(G/N) + (N - 1) log J1                       (minus twice the log evidence, up to a constant)
     J3 = J2 + log(Geff - 1) + log(N - Geff)
@@ -19,7 +19,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.adaptive import kernels, lapack
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 
@@ -30,7 +30,6 @@ class EvidenceSamples:
 
     X: FloatArray
     y: FloatArray
-    weights: FloatArray
 
     @property
     def size(self) -> int:
@@ -44,23 +43,21 @@ class EvidenceSamples:
 
     def subset(self, rows: NDArray[np.int64]) -> EvidenceSamples:
         """Some of the rows."""
-        return EvidenceSamples(self.X[rows], self.y[rows], self.weights[rows])
+        return EvidenceSamples(self.X[rows], self.y[rows])
 
 
-def evidence_samples(X: FloatArray, y: FloatArray, weights: FloatArray | None = None) -> EvidenceSamples:
+def evidence_samples(X: FloatArray, y: FloatArray) -> EvidenceSamples:
     """Check and collect normalised samples; arguments as those of `lssvm.fit`. Raises InputError."""
     X, y = np.ascontiguousarray(X, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
     if X.ndim != 2 or y.shape != (X.shape[0],):
         raise InputError(f"X, y: got shapes {X.shape} and {y.shape}, expected (N, d) and (N,)")
     if y.size < 4:
         raise InputError(f"X: got {y.size} samples, expected at least 4 to infer hyper-parameters from")
-    w = np.ones(y.size) if weights is None else np.ascontiguousarray(weights, dtype=np.float64)
-    finite = np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(w))
-    if not finite or w.shape != y.shape or not np.all(w > 0):
-        raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
+    if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y))):
+        raise InputError("X, y: got values that are not finite; drop those rows")
     if np.ptp(y) == 0:
         raise InputError("y: all targets are equal, nothing can be inferred from them; excite the stage")
-    return EvidenceSamples(X, y, w)
+    return EvidenceSamples(X, y)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +87,7 @@ class Evidence:
     J2_curvature: float
 
 
-@lapack.one_thread
+@lssvm.one_thread
 def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
     """Evidence at one pair of gamma and widths (d,), with its gradients.
 
@@ -99,13 +96,13 @@ def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_leve
     NumericsError : R is singular in double precision at these hyper-parameters.
     """
     n = data.size
-    K = kernels.gram(data.X, None, widths)
-    noise = 1.0 / (gamma * data.weights)
+    K = features.gram(data.X, None, widths)
+    noise = np.full(n, 1.0 / gamma)
     P = K.copy()
     P[np.diag_indices(n)] += noise
-    lapack.cholesky_lower(P)
+    lssvm.cholesky_lower(P)
     log_det = 2.0 * float(np.sum(np.log(np.diag(P))))
-    lapack.inverse_from_cholesky(P)
+    lssvm.inverse_from_cholesky(P)
     Pc = np.tril(P, -1)
     Pc += Pc.T
     Pc[np.diag_indices(n)] = np.diag(P)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.lssvm import one_thread
 from dehyst.adaptive.online.kernel_window import SAME
 from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.tuning.evidence import evidence_samples
@@ -65,7 +65,7 @@ def propose(data: WindowData, config: RetuneConfig | None = None) -> Proposal:
     if not scale > 0.0:
         raise InputError("data: all targets are equal, nothing can be inferred from them; excite the stage")
     # Neither the differences of J2 nor its optimum depend on the scale of the targets.
-    whole = evidence_samples(data.kernel, (data.targets_V - centre) / scale, data.weights)
+    whole = evidence_samples(data.kernel, (data.targets_V - centre) / scale)
     part = whole.subset(_spread_rows(n, config.rows))
     here = _logarithms(data.hyper)
     low, high = bounds_of(data.hyper, config)
@@ -201,7 +201,7 @@ def significance(difference: FloatArray) -> tuple[float, float]:
 
 def _window(data: WindowData, hyper: Hyperparameters, capacity: int) -> Window:
     config = WindowConfig(capacity, tuple(hyper.widths), hyper.gamma)
-    return Window.from_samples(config, data.kernel, data.targets_V, data.weights)
+    return Window.from_samples(config, data.kernel, data.targets_V)
 
 
 def _slot(window: Window, x: FloatArray) -> int:

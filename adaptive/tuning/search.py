@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.lssvm import one_thread
 from dehyst.adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
 from dehyst.adaptive.types import FloatArray
 

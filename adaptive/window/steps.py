@@ -1,12 +1,12 @@
-"""The steps of the sliding window, compiled: its prediction, and one sample in, out, or with another weight.
+"""The steps of the sliding window, compiled: its prediction, and one sample in or out.
 
 Replacing slot k in the inverse form, with the kernel column b of the new sample (b_k := 0) and p = P e_k:
 
-    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/(gamma w) - b'q,  q_k := -1,
+    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/gamma - b'q,  q_k := -1,
     P <- P - p p'/p_kk + q q'/s.
 
 S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and alpha = Sy - b S. The Cholesky form is
-described in `adaptive.window.cholesky_form`.
+described in `adaptive.window.arrays`.
 
 Every function takes the arrays of the window and returns a `Status` as int, or a number. Nothing allocates and nothing
 raises. A step that would leave the finite numbers is refused, counted and taken back: samples, alpha and bias are then
@@ -19,11 +19,9 @@ from __future__ import annotations
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled, compiled_reassociating, dot
-from dehyst.adaptive.kernels import rbf_column
+from dehyst.adaptive.features import rbf_column
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import cholesky_form as cholesky
-from dehyst.adaptive.window import inverse_form as inverse
 from dehyst.adaptive.window.arrays import WindowArrays, arrays_of
 
 # --- The kernel column of a point, and what the window predicts there.
@@ -79,34 +77,26 @@ def scale(A: WindowArrays) -> float:
 
 
 @compiled_reassociating
-def _acceptable_weight(A: WindowArrays, w: float) -> bool:
-    """True where double precision can tell the sample's noise variance 1/(gamma w) from the kernel."""
-    precision: float = A.F[ws.GAMMA] * w
-    return precision >= ws.LEAST_PRECISION and precision <= ws.MOST_PRECISION
-
-
-@compiled_reassociating
-def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
-    """Features and target finite and at most MOST, a weight as above."""
-    good = abs(y) <= ws.MOST and _acceptable_weight(A, w)
+def acceptable(A: WindowArrays, x: FloatArray, y: float) -> bool:
+    """Features and target finite and at most MOST."""
+    good = abs(y) <= ws.MOST
     for j in range(x.shape[0]):
         good = good and abs(x[j]) <= ws.MOST
     return good
 
 
 @compiled_reassociating
-def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
+def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float) -> None:
     """Put a sample into a slot, and its kernel column (in COLUMN, but for the slot's own element) into R."""
     column, row, n = A.V[ws.COLUMN], A.R[slot], A.C[ws.COUNT]
     for j in range(n):
         row[j] = column[j]
         A.R[j, slot] = column[j]
-    A.R[slot, slot] = 1.0 + 1.0 / (A.F[ws.GAMMA] * w)
+    A.R[slot, slot] = 1.0 + 1.0 / A.F[ws.GAMMA]
     for i in range(x.shape[0]):
         A.X[i, slot] = x[i]
         A.scaled[i, slot] = x[i] * A.inverse_widths[i]
     A.V[ws.Y, slot] = y
-    A.V[ws.W, slot] = w
 
 
 @compiled_reassociating
@@ -121,7 +111,6 @@ def _keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
     for i in range(A.X.shape[0]):
         A.U[ws.UNDO_POINT, 1 + i] = A.X[i, slot]
     A.F[ws.UNDO_Y] = A.V[ws.Y, slot]
-    A.F[ws.UNDO_W] = A.V[ws.W, slot]
     A.C[ws.UNDO] = kind
     A.C[ws.UNDO_SLOT] = slot
 
@@ -149,7 +138,6 @@ def _restore_sample(A: WindowArrays) -> None:
         A.X[i, slot] = A.U[ws.UNDO_POINT, 1 + i]
         A.scaled[i, slot] = A.X[i, slot] * A.inverse_widths[i]
     A.V[ws.Y, slot] = A.F[ws.UNDO_Y]
-    A.V[ws.W, slot] = A.F[ws.UNDO_W]
 
 
 # --- The solution (2.29) from S and Sy.
@@ -201,11 +189,11 @@ def finish(A: WindowArrays) -> bool:
     rest = A.V[ws.ALPHA] if inverse_form else A.V[ws.Z]
     for j in range(n):
         rest[j] = sy[j]
-    inverse.add_scaled(rest, -A.F[ws.BETA], A.S, n)
+    ws.add_scaled(rest, -A.F[ws.BETA], A.S, n)
     good = good and bool(np.isfinite(A.F[ws.BETA])) and finite(rest, n)
     if inverse_form:
         return good
-    cholesky.backward(A, rest)
+    ws.backward(A, rest)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] = rest[i]
     return good and finite(rest, n)
@@ -224,9 +212,9 @@ def _scale_into(target: FloatArray, source: FloatArray, factor: float, n: int) -
 def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
     """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
     n = A.C[ws.COUNT]
-    inverse.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
+    ws.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
     A.S[slot] = 0.0
-    inverse.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
+    ws.add_scaled(A.V[ws.SY], -A.V[ws.SY, slot] / p[slot], p, n)
     A.V[ws.SY, slot] = 0.0
 
 
@@ -234,38 +222,38 @@ def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
 def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
     n = A.C[ws.COUNT]
-    inverse.add_scaled(A.S, _add_up(q, n) / s, q, n)
-    inverse.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
+    ws.add_scaled(A.S, _add_up(q, n) / s, q, n)
+    ws.add_scaled(A.V[ws.SY], dot(q, A.V[ws.Y], n) / s, q, n)
 
 
 @compiled_reassociating
-def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     b, z, p, q = A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.PK], A.V[ws.TRIAL]
     b[slot] = 0.0
-    inverse.multiply(A, b, z)
+    ws.multiply(A, b, z)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
-    inverse.lift_column(A, slot, p)
+    ws.lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
         q[j] = z[j] - factor * p[j]
     q[slot] = 0.0
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(b, q, n)
     # What P gains and loses on its diagonal bounds what it does elsewhere.
     good = pkk > 0.0 and s > ws.SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
     if good:
         q[slot] = -1.0
         _take_out_inverse(A, slot, p)
-        _write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y)
         _take_in_inverse(A, q, s)
         good = finish(A)
     if not good:
         # _write_sample may not have run: restoring writes the same values again.
         _restore_solution(A)
         _restore_sample(A)
-        inverse.lower_column(A, slot, p)
+        ws.lower_column(A, slot, p)
         return ws.ILL_CONDITIONED
     _scale_into(A.V[ws.MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[ws.MINUS, slot] = 0.0
@@ -275,11 +263,11 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
 
 
 @compiled_reassociating
-def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+def _append_inverse(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     b, q = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    inverse.multiply(A, b, q)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    ws.multiply(A, b, q)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(b, q, n)
     _keep_for_undo(A, n, ws.UNDO_APPEND)
     good = s > ws.SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
@@ -289,7 +277,7 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         A.V[ws.SY, n] = 0.0
         for j in range(n + 1):
             A.P[n, j] = 0.0
-        _write_sample(A, n, x, y, w)
+        _write_sample(A, n, x, y)
         A.C[ws.COUNT] = n + 1
         _take_in_inverse(A, q, s)
         good = finish(A)
@@ -309,24 +297,24 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 
 @compiled_reassociating
-def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     column, half = A.V[ws.COLUMN], A.V[ws.TRIAL]
-    place = cholesky.position_of(A, slot)
+    place = ws.position_of(A, slot)
     _keep_for_undo(A, slot, ws.UNDO_REPLACE)
     for i in range(place):
         half[i] = column[A.order[i]]
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
-    cholesky.delete(A, place, half)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    ws.delete(A, place, half)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n - 1)
     good = s > ws.SCHUR_SHARE * noise
     if good:
         A.C[ws.COUNT] = n
-        _write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y)
         A.C[ws.COUNT] = n - 1
-        cholesky.add(A, slot, half, np.sqrt(s))
+        ws.add(A, slot, half, np.sqrt(s))
         good = finish(A)
     if not good:
         A.C[ws.COUNT] = n
@@ -338,25 +326,25 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
 @compiled_reassociating
 def _restore_replaced_cholesky(A: WindowArrays) -> None:
     """The window as it was before the sample of UNDO_SLOT was replaced, to the last bit. COUNT is what it was."""
-    cholesky.restore_factor(A)
+    ws.restore_factor(A)
     _restore_solution(A)
     _restore_sample(A)
 
 
 @compiled_reassociating
-def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+def _append_cholesky(A: WindowArrays, x: FloatArray, y: float) -> int:
     n = A.C[ws.COUNT]
     half = A.V[ws.TRIAL]
-    cholesky.gather(A, A.V[ws.COLUMN], half)
-    cholesky.forward(A, half)
-    noise = 1.0 / (A.F[ws.GAMMA] * w)
+    ws.gather(A, A.V[ws.COLUMN], half)
+    ws.forward(A, half)
+    noise = 1.0 / A.F[ws.GAMMA]
     s = 1.0 + noise - dot(half, half, n)
     if not s > ws.SCHUR_SHARE * noise:
         return ws.ILL_CONDITIONED
     _keep_for_undo(A, n, ws.UNDO_APPEND)
-    _write_sample(A, n, x, y, w)
-    cholesky.append_row(A, half)
-    cholesky.add(A, n, half, np.sqrt(s))
+    _write_sample(A, n, x, y)
+    ws.append_row(A, half)
+    ws.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)
         return ws.ILL_CONDITIONED
@@ -413,13 +401,13 @@ def resum(A: WindowArrays) -> bool:
     for j in range(n):
         ones[j] = 1.0
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        inverse.solve(A, ones, A.S)
-        inverse.solve(A, A.V[ws.Y], A.V[ws.SY])
+        ws.solve(A, ones, A.S)
+        ws.solve(A, A.V[ws.Y], A.V[ws.SY])
     else:
-        cholesky.gather(A, ones, A.S)
-        cholesky.forward(A, A.S)
-        cholesky.gather(A, A.V[ws.Y], A.V[ws.SY])
-        cholesky.forward(A, A.V[ws.SY])
+        ws.gather(A, ones, A.S)
+        ws.forward(A, A.S)
+        ws.gather(A, A.V[ws.Y], A.V[ws.SY])
+        ws.forward(A, A.V[ws.SY])
     return finish(A)
 
 
@@ -429,12 +417,12 @@ def _refine_inverse(A: WindowArrays) -> bool:
     n, residual, z, sy = A.C[ws.COUNT], A.V[ws.COLUMN], A.V[ws.Z], A.V[ws.SY]
     for i in range(n):
         residual[i] = 1.0 - dot(A.R[i], A.S, n)
-    inverse.solve(A, residual, z)
-    inverse.add_scaled(A.S, 1.0, z, n)
+    ws.solve(A, residual, z)
+    ws.add_scaled(A.S, 1.0, z, n)
     for i in range(n):
         residual[i] = A.V[ws.Y, i] - dot(A.R[i], sy, n)
-    inverse.solve(A, residual, z)
-    inverse.add_scaled(sy, 1.0, z, n)
+    ws.solve(A, residual, z)
+    ws.add_scaled(sy, 1.0, z, n)
     return finish(A)
 
 
@@ -444,11 +432,11 @@ def _refine_cholesky(A: WindowArrays) -> bool:
     n, good, t = A.C[ws.COUNT], resum(A), A.V[ws.MINUS]
     for i in range(n):
         t[i] = _row_residual(A, A.order[i])
-    cholesky.forward(A, t)
+    ws.forward(A, t)
     correction = _solve_bias(A, dot(A.S, t, n))
-    inverse.add_scaled(t, -correction, A.S, n)
+    ws.add_scaled(t, -correction, A.S, n)
     A.F[ws.BETA] += correction
-    cholesky.backward(A, t)
+    ws.backward(A, t)
     for i in range(n):
         A.V[ws.ALPHA, A.order[i]] += t[i]
     return good and bool(np.isfinite(A.F[ws.BETA])) and finite(A.V[ws.ALPHA], n)
@@ -490,7 +478,7 @@ def take_back(A: WindowArrays) -> None:
     elif A.C[ws.FORM] == ws.INVERSE_FORM:
         _restore_solution(A)
         _restore_sample(A)
-        inverse.lower_column(A, slot, A.V[ws.PK])
+        ws.lower_column(A, slot, A.V[ws.PK])
     else:
         _restore_replaced_cholesky(A)
     if A.C[ws.FORM] == ws.INVERSE_FORM:
@@ -523,58 +511,40 @@ def _checked(A: WindowArrays, status: int) -> int:
 
 
 @compiled_reassociating
-def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    """The sample in ``slot`` makes way for (x, y) of noise weight w. O(N²).
+def replace(A: WindowArrays, slot: int, x: FloatArray, y: float) -> int:
+    """The sample in ``slot`` makes way for (x, y). O(N²).
 
     Checks one rotating row's residual afterwards and refines where it exceeds the tolerance.
     """
-    if not acceptable(A, x, y, w):
+    if not acceptable(A, x, y):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
     if slot < 0 or slot >= A.C[ws.COUNT]:
         return ws.NO_SLOT
     _kernel_column(A, x, A.V[ws.COLUMN])
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        status = _checked(A, _replace_inverse(A, slot, x, y, w))
+        status = _checked(A, _replace_inverse(A, slot, x, y))
     else:
-        status = _checked(A, _replace_cholesky(A, slot, x, y, w))
+        status = _checked(A, _replace_cholesky(A, slot, x, y))
     A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
 
 
 @compiled_reassociating
-def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    """One more slot, for (x, y) of noise weight w. O(N²)."""
-    if not acceptable(A, x, y, w):
+def append(A: WindowArrays, x: FloatArray, y: float) -> int:
+    """One more slot, for (x, y). O(N²)."""
+    if not acceptable(A, x, y):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
     if A.C[ws.COUNT] >= A.P.shape[0]:
         return ws.NO_SLOT
     _kernel_column(A, x, A.V[ws.COLUMN])
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        status = _checked(A, _append_inverse(A, x, y, w))
+        status = _checked(A, _append_inverse(A, x, y))
     else:
-        status = _checked(A, _append_cholesky(A, x, y, w))
+        status = _checked(A, _append_cholesky(A, x, y))
     A.C[ws.STEPS] += status == ws.ACCEPTED
     return status
-
-
-@compiled_reassociating
-def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Give the sample in ``slot`` the noise weight w: out and in again, which is exact for any change. O(N²)."""
-    if slot < 0 or slot >= A.C[ws.COUNT]:
-        return ws.NO_SLOT
-    if not _acceptable_weight(A, w):
-        A.C[ws.BAD_INPUTS] += 1
-        return ws.BAD_INPUT
-    x = A.point
-    for i in range(x.shape[0]):
-        x[i] = A.X[i, slot]
-    for j in range(A.C[ws.COUNT]):
-        A.V[ws.COLUMN, j] = A.R[slot, j]
-    if A.C[ws.FORM] == ws.INVERSE_FORM:
-        return _checked(A, _replace_inverse(A, slot, x, A.V[ws.Y, slot], w))
-    return _checked(A, _replace_cholesky(A, slot, x, A.V[ws.Y, slot], w))
 
 
 # --- Leave-one-out.
@@ -588,17 +558,17 @@ def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
     """
     n, root = A.C[ws.COUNT], A.F[ws.GRAM]
     if A.C[ws.FORM] == ws.INVERSE_FORM:
-        inverse.diagonal(A, out)
+        ws.inverse_diagonal(A, out)
         alpha, s = A.V[ws.ALPHA], A.S
         for i in range(n):
             half = s[i] / root if root > 0.0 else 0.0
             out[i] = _left_out(alpha[i], out[i], out[i] - half * half)
         return
-    cholesky.diagonal(A, out)
+    ws.cholesky_diagonal(A, out)
     t, factor = A.V[ws.TRIAL], 1.0 / root if root > 0.0 else 0.0
     for i in range(n):
         t[i] = factor * A.S[i]
-    cholesky.backward(A, t)
+    ws.backward(A, t)
     for i in range(n):
         slot = A.order[i]
         out[slot] = _left_out(A.V[ws.ALPHA, slot], out[slot], out[slot] - t[i] * t[i])

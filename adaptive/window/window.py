@@ -8,17 +8,18 @@ the oracle that the tests compare with.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from dehyst.adaptive import kernels, lapack, lssvm
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.state import Entry
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import cholesky_form, steps
+from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, WindowArrays
 
 # --- Configuration.
@@ -58,7 +59,7 @@ class WindowConfig:
     ----------
     capacity : N, the number of slots.
     widths : kernel width of each of the d features, (2.31).
-    gamma : regularisation, > 0; the noise variance of sample i is 1/(gamma w_i) of the kernel's.
+    gamma : regularisation, > 0; the noise variance is 1/gamma of the kernel's.
     form : ``inverse`` is the fastest, its error grows with cond(R)²; ``cholesky`` takes about twice the time, its
         error grows with cond(R); ``auto`` takes the one that ``accuracy`` and the condition of the samples require,
         each time the window is made from samples or healed. An empty window starts as ``inverse``.
@@ -79,7 +80,7 @@ class WindowConfig:
             raise InputError(f"capacity: got {self.capacity}, expected the number of samples to keep, at least 1")
         if len(self.widths) < 1:
             raise InputError("widths: got none, expected one kernel width a feature")
-        object.__setattr__(self, "widths", tuple(map(float, kernels.as_widths(self.widths, len(self.widths)))))
+        object.__setattr__(self, "widths", tuple(map(float, features.as_widths(self.widths, len(self.widths)))))
         object.__setattr__(self, "gamma", lssvm.check_gamma(self.gamma))
         if not ws.LEAST_PRECISION <= self.gamma <= ws.MOST_PRECISION:
             raise InputError(
@@ -110,7 +111,7 @@ class SolverState:
     scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
     inverse_widths: Annotated[FloatArray, Entry("one over the widths", "", "d", low=1e-100)]
     S: Annotated[FloatArray, Entry("P 1, or L^-1 1 by position", "", "N")]
-    V: Annotated[FloatArray, Entry("targets, noise weights, dual weights and other vectors", "V", f"{ws.ROWS},N")]
+    V: Annotated[FloatArray, Entry("targets, dual weights and other vectors", "V", f"{ws.ROWS},N")]
     U: Annotated[FloatArray, Entry("what a refused step restores", "", f"{ws.UNDO_ROWS},room")]
     F: Annotated[FloatArray, Entry("regularisation, residuals, bias", "", f"{ws.FLOATS}")]
     C: Annotated[IntArray, Entry("counters", "", f"{ws.COUNTERS}", low=-1)]
@@ -157,9 +158,7 @@ class Window:
         return Window, (self.config, self._arrays)
 
     @classmethod
-    def from_samples(
-        cls, config: WindowConfig, X: FloatArray, y: FloatArray, weights: FloatArray | None = None
-    ) -> Window:
+    def from_samples(cls, config: WindowConfig, X: FloatArray, y: FloatArray) -> Window:
         """A window that holds the samples ``X`` (n, d), ``y`` (n,), n <= N, solved by one factorisation.
 
         Raises
@@ -168,29 +167,25 @@ class Window:
         NumericsError : their kernel matrix is singular in double precision.
         """
         X, y = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        w = np.ones(y.shape) if weights is None else np.asarray(weights, dtype=np.float64)
         n = y.size
-        if X.shape != (n, config.dimension) or y.shape != (n,) or w.shape != (n,) or not 0 < n <= config.capacity:
+        if X.shape != (n, config.dimension) or y.shape != (n,) or not 0 < n <= config.capacity:
             raise InputError(
-                f"X, y, weights: got shapes {X.shape}, {y.shape}, {w.shape}, expected (n, {config.dimension}), (n,), "
-                f"(n,) with 1 <= n <= {config.capacity}, the capacity"
+                f"X, y: got shapes {X.shape}, {y.shape}, expected (n, {config.dimension}), (n,) with "
+                f"1 <= n <= {config.capacity}, the capacity"
             )
-        precision = config.gamma * w
-        bounded = np.all(np.abs(X) <= ws.MOST) and np.all(np.abs(y) <= ws.MOST)
-        if not (bounded and np.all((precision >= ws.LEAST_PRECISION) & (precision <= ws.MOST_PRECISION))):
+        if not (np.all(np.abs(X) <= ws.MOST) and np.all(np.abs(y) <= ws.MOST)):
             raise InputError(
-                f"X, y, weights: got values that are not finite, larger than {ws.MOST:g}, or weights with gamma w "
-                f"outside {ws.LEAST_PRECISION:g} to {ws.MOST_PRECISION:g}; normalise them, and drop samples that are "
-                "not finite"
+                f"X, y: got values that are not finite or larger than {ws.MOST:g}; normalise them, and drop samples "
+                "that are not finite"
             )
         window = cls(config)
         A = window.arrays
         A.C[ws.COUNT] = n
         A.X[:, :n] = X.T
         A.scaled[:, :n] = X.T * A.inverse_widths[:, None]
-        A.V[ws.Y, :n], A.V[ws.W, :n] = y, w
-        A.R[:n, :n] = kernels.gram(A.scaled[:, :n].T, None, np.ones(config.dimension))
-        A.R[np.arange(n), np.arange(n)] = 1.0 + 1.0 / (config.gamma * w)
+        A.V[ws.Y, :n] = y
+        A.R[:n, :n] = features.gram(A.scaled[:, :n].T, None, np.ones(config.dimension))
+        A.R[np.arange(n), np.arange(n)] = 1.0 + 1.0 / config.gamma
         A.C[ws.FORM] = window.form_called_for()
         window.rebuild()
         return window
@@ -231,11 +226,6 @@ class Window:
         return self._arrays.V[ws.Y, : len(self)].copy()
 
     @property
-    def weights(self) -> FloatArray:
-        """Noise weights by slot, (n,), a copy."""
-        return self._arrays.V[ws.W, : len(self)].copy()
-
-    @property
     def alpha(self) -> FloatArray:
         """Dual weights by slot, (n,), a copy."""
         return self._arrays.V[ws.ALPHA, : len(self)].copy()
@@ -269,17 +259,13 @@ class Window:
 
     # --- steps ---------------------------------------------------------------------------------------------
 
-    def append(self, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+    def append(self, x: FloatArray, y: float) -> Status:
         """Take one more sample; ``x`` is (d,). NO_SLOT where the window is full."""
-        return Status(steps.append(self._arrays, self._point(x), float(y), float(weight)))
+        return Status(steps.append(self._arrays, self._point(x), float(y)))
 
-    def replace(self, slot: int, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+    def replace(self, slot: int, x: FloatArray, y: float) -> Status:
         """Put a new sample in place of the one in ``slot``; ``x`` is (d,). O(N²)."""
-        return Status(steps.replace(self._arrays, int(slot), self._point(x), float(y), float(weight)))
-
-    def reweight(self, slot: int, weight: float) -> Status:
-        """Change the noise weight of the sample in ``slot``: less than 1 for an old or doubtful one."""
-        return Status(steps.reweight(self._arrays, int(slot), float(weight)))
+        return Status(steps.replace(self._arrays, int(slot), self._point(x), float(y)))
 
     def _point(self, x: FloatArray) -> FloatArray:
         point = np.ascontiguousarray(x, dtype=np.float64)
@@ -292,20 +278,20 @@ class Window:
     def rebuild(self) -> None:
         """Factor R anew in place, by Cholesky; O(N³), without the interpreter's lock.
 
-        `adaptive.window.healing` does the same beside a window that keeps learning. Raises NumericsError where R
+        `adaptive.window.window` does the same beside a window that keeps learning. Raises NumericsError where R
         is not positive definite in double precision; the window is then as it was.
         """
         A, n = self._arrays, len(self)
         P = A.R.copy()
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
-            lapack.cholesky_upper(P, n)
+            lssvm.cholesky_upper(P, n)
         else:
-            lapack.cholesky_lower(P, n)
-            lapack.inverse_from_cholesky(P, n)
+            lssvm.cholesky_lower(P, n)
+            lssvm.inverse_from_cholesky(P, n)
         before = ws.duplicate(A)
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
             A.order[:n] = np.arange(n)
-            cholesky_form.take_upper(A, P)
+            ws.take_upper(A, P)
         else:
             A.P[:] = P
         A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
@@ -348,7 +334,7 @@ class Window:
         n = len(self)
         if n == 0:
             return 1.0
-        return _largest_eigenvalue(self._arrays.R[:n, :n]) * self.config.gamma * float(np.max(self.weights))
+        return _largest_eigenvalue(self._arrays.R[:n, :n]) * self.config.gamma
 
     @property
     def round_residual(self) -> float:
@@ -373,7 +359,7 @@ class Window:
 
     def with_hyperparameters(self, widths: tuple[float, ...], gamma: float) -> Window:
         """A new window over the same samples with other hyper-parameters; its counters start at zero."""
-        return Window.from_samples(replace(self.config, widths=widths, gamma=gamma), self.X, self.y, self.weights)
+        return Window.from_samples(replace(self.config, widths=widths, gamma=gamma), self.X, self.y)
 
     def copy(self) -> Window:
         """An independent window in the same state, to the last bit."""
@@ -402,7 +388,7 @@ class Window:
             getattr(A, name)[...] = getattr(state, name)
         A.C[ws.UNDO] = ws.UNDO_NOTHING
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
-            cholesky_form.take_upper(A, A.P.copy())
+            ws.take_upper(A, A.P.copy())
         return window
 
 
@@ -414,7 +400,7 @@ def _matrices(A: ws.WindowArrays) -> dict[str, FloatArray]:
     """
     if A.C[ws.FORM] == ws.CHOLESKY_FORM:
         upper = np.zeros_like(A.P)
-        cholesky_form.write_upper(A, upper)
+        ws.write_upper(A, upper)
         return {"P": upper, "R": A.R.copy()}
     n = A.P.shape[0]
     packed = np.empty((n, n + 1))
@@ -437,3 +423,193 @@ def _largest_eigenvalue(R: FloatArray, iterations: int = 12) -> float:
         value = float(v @ w / (v @ v))
         v = w / np.linalg.norm(w)
     return value
+
+
+# --- Healing a window at work: a thread makes a new factorisation, which is swapped in a fixed number of steps later.
+#
+# The result does not depend on the speed of the thread: where it is not ready in time, the stepping thread waits for
+# it. A replay, a copy and a window restored from its state continue with the same numbers to the last bit.
+
+
+# --- A refresh costs O(N³), as much as some hundred steps. It has three parts: `begin_refresh` copies the state
+# (stepping thread, O(N²)), `Refresh.factor` factors the copy (any thread, without the interpreter's lock),
+# `Refresh.finish` applies the steps made meanwhile, one for each changed slot, and swaps the arrays in (stepping
+# thread).
+
+
+#: Arrays that a factorisation reads and does not write.
+_FIELDS = ("R", "X", "scaled")
+
+
+@dataclass(slots=True)
+class HealingState:
+    """A refresh in progress: what it factors."""
+
+    left: Annotated[int, Entry("steps until it is swapped in", low=-1, high=1000)]
+    R: Annotated[FloatArray, Entry("kernel matrix with the noise variances", "", "N,N")]
+    X: Annotated[FloatArray, Entry("features", "", "d,N")]
+    scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
+    y: Annotated[FloatArray, Entry("targets", "V", "N")]
+    count: Annotated[int, Entry("samples at its beginning", low=1)]
+    form: Annotated[int, Entry("form of the window: 0 inverse, 1 Cholesky", low=0, high=1)]
+    new_form: Annotated[int, Entry("form of the new factorisation", low=0, high=1)]
+
+    def check_state(self) -> None:
+        """Raise ValueError where there are more samples than slots."""
+        if self.count > self.y.size:
+            raise ValueError(f"count: got {self.count}, expected at most the window's {self.y.size} samples")
+
+
+class Refresh:
+    """A refresh in progress. ``form`` : of the new factorisation; that of the window unless given."""
+
+    def __init__(self, window: Window, form: int | None = None) -> None:
+        self._source = window
+        self._form = int(window.arrays.C[ws.FORM])
+        self._copy = window.copy()
+        self._copy.arrays.C[ws.FORM] = self._form if form is None else form
+        self._count = len(window)
+        self._factored = False
+
+    def factor(self) -> None:
+        """Factor the copy. Any thread. Raises NumericsError where R is not positive definite."""
+        self._copy.rebuild()
+        self._factored = True
+
+    @property
+    def factored(self) -> bool:
+        """Whether `factor` has succeeded."""
+        return self._factored
+
+    def changed_slots(self) -> IntArray:
+        """Slots whose sample differs from the copy's, in order."""
+        n, now, then = self._count, self._source.arrays, self._copy.arrays
+        return np.flatnonzero(np.any(now.X[:, :n] != then.X[:, :n], axis=0))
+
+    def finish(self) -> bool:
+        """Bring the factored copy up to date and swap it in. The stepping thread.
+
+        Returns
+        -------
+        False where nothing was swapped: not factored yet, the form changed since, or a step of the catch-up refused.
+        """
+        n, source, copy = len(self._source), self._source.arrays, self._copy
+        if not self._factored or source.C[ws.FORM] != self._form:
+            return False
+        y = source.V[ws.Y]
+        for slot in self.changed_slots():
+            if copy.replace(int(slot), np.ascontiguousarray(source.X[:, slot]), y[slot]) != ws.ACCEPTED:
+                return False
+        for slot in range(self._count, n):
+            if copy.append(np.ascontiguousarray(source.X[:, slot]), y[slot]) != ws.ACCEPTED:
+                return False
+        copy.arrays.V[ws.Y, :n] = y[:n]
+        copy.arrays.C[ws.CURSOR :] = source.C[ws.CURSOR :]
+        copy.arrays.C[ws.REFRESHES] += 1
+        copy.arrays.F[ws.RESIDUAL : ws.LAST_WORST + 1] = source.F[ws.RESIDUAL : ws.LAST_WORST + 1]
+        if not steps.resum(copy.arrays):
+            return False
+        copy.arrays.C[ws.UNDO] = ws.UNDO_NOTHING
+        self._source.take_arrays(copy.arrays)
+        return True
+
+    def state(self, left: int) -> HealingState:
+        """The input of the factorisation, as it was at the beginning. May be called while `factor` runs."""
+        A = self._copy.arrays
+        fields = {name: getattr(A, name).copy() for name in _FIELDS}
+        y = A.V[ws.Y].copy()
+        return HealingState(left, **fields, y=y, count=self._count, form=self._form, new_form=int(A.C[ws.FORM]))
+
+    @classmethod
+    def of(cls, window: Window, state: HealingState) -> Refresh:
+        """Inverse of ``state``, for ``window``. The factor has to be made again; it comes out the same."""
+        made = cls(window, state.new_form)
+        A = made._copy.arrays
+        for name in _FIELDS:
+            getattr(A, name)[...] = getattr(state, name)
+        A.V[ws.Y] = state.y
+        A.C[ws.COUNT] = made._count = state.count
+        made._form = state.form
+        return made
+
+
+def begin_refresh(window: Window, form: int | None = None) -> Refresh:
+    """Start refreshing ``window``, which may continue to step. Raises NumericsError while it is empty."""
+    if len(window) == 0:
+        raise NumericsError("refresh: the window is empty, there is nothing to factor; wait for samples")
+    return Refresh(window, form)
+
+
+#: Steps from the refusal that begins a refresh to the swap. At 100 steps a second this is a third of a second, ten
+#: times the time to factor 500 samples; to catch up costs at most a fifth of a factorisation.
+HEALING_STEPS = 32
+
+
+class Healing:
+    """At most one refresh of one window. Owns the thread ``window-healing``. Not for two threads at a time."""
+
+    def __init__(self, window: Window) -> None:
+        self._window = window
+        self._refresh: Refresh | None = None
+        self._thread: threading.Thread | None = None
+        self._left = 0
+
+    @property
+    def open(self) -> bool:
+        """Whether a refresh is in progress."""
+        return self._refresh is not None
+
+    def begin(self) -> None:
+        """Start a refresh unless one is in progress. The window must hold samples."""
+        if self._refresh is None:
+            self._refresh, self._left = begin_refresh(self._window, self._window.form_called_for()), HEALING_STEPS
+            self._start()
+
+    def step(self) -> None:
+        """Call before each step of the window: swap in the refresh that is due. Where that fails, heal in line."""
+        if self._refresh is None:
+            return
+        self._left -= 1
+        if self._left > 0:
+            return
+        self._wait()
+        refresh, self._refresh = self._refresh, None
+        if not refresh.finish():
+            self._window.heal()
+
+    def _start(self) -> None:
+        assert self._refresh is not None
+        self._thread = threading.Thread(target=_factor, args=(self._refresh,), name="window-healing", daemon=True)
+        self._thread.start()
+
+    def _wait(self) -> None:
+        if self._thread is not None:
+            self._thread.join()
+        elif self._refresh is not None and not self._refresh.factored:
+            _factor(self._refresh)
+        self._thread = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Threads are not copied: wait, so that the copy has the factor.
+        self._wait()
+        return self.__dict__.copy()
+
+    def state(self) -> HealingState | None:
+        """None where no refresh is in progress. Does not wait for the thread."""
+        return None if self._refresh is None else self._refresh.state(self._left)
+
+    @classmethod
+    def of(cls, window: Window, state: HealingState | None) -> Healing:
+        """Inverse of ``state``: continues with the same result to the last bit."""
+        made = cls(window)
+        if state is not None:
+            made._left, made._refresh = state.left, Refresh.of(window, state)
+            made._start()
+        return made
+
+
+def _factor(refresh: Refresh) -> None:
+    try:
+        refresh.factor()
+    except NumericsError:
+        return  # `Refresh.finish` returns False then.

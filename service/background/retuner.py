@@ -159,8 +159,8 @@ class Retuner:
         }
         self._state = TRYING
         columns = np.frombuffer(b"".join(self._fresh)).reshape(len(self._fresh), -1)
-        kernel, targets_V, weights = columns[:, :-2], columns[:, -2], columns[:, -1]
-        after = WindowData(kernel, targets_V, weights, np.arange(len(columns), 0, -1.0) - 1.0, before.hyper)
+        kernel, targets_V = columns[:, :-1], columns[:, -1]
+        after = WindowData(kernel, targets_V, np.arange(len(columns), 0, -1.0) - 1.0, before.hyper)
         self._job = start_job(order, pack("before", before) | pack("after", after), self.config.timeout_s)
 
     def _collect(self, data: WindowData) -> None:
@@ -220,5 +220,5 @@ def _taught(learner: OnlineModel) -> int:
 
 def _rows(data: WindowData, which: NDArray[np.int64]) -> list[bytes]:
     """Each sample as the bytes of its inputs, target and weight: equal samples give equal bytes."""
-    columns = np.ascontiguousarray(np.column_stack([data.kernel, data.targets_V, data.weights])[which])
+    columns = np.ascontiguousarray(np.column_stack([data.kernel, data.targets_V])[which])
     return [row.tobytes() for row in columns]

@@ -27,15 +27,15 @@ def start_job(order: dict[str, Any], arrays: dict[str, FloatArray], timeout_s: f
 def pack(name: str, data: WindowData) -> dict[str, FloatArray]:
     """The samples of a window as arrays, which `unpack` finds under ``name``."""
     hyper = np.array([data.hyper.gamma, *data.hyper.widths])
-    parts = {"kernel": data.kernel, "targets_V": data.targets_V, "weights": data.weights, "age": data.age}
+    parts = {"kernel": data.kernel, "targets_V": data.targets_V, "age": data.age}
     return {f"{name}.{key}": value for key, value in {**parts, "hyper": hyper}.items()}
 
 
 def unpack(name: str, arrays: Mapping[str, FloatArray]) -> WindowData:
     """Inverse of `pack`."""
     hyper = arrays[f"{name}.hyper"]
-    kernel, targets_V, weights, age = (arrays[f"{name}.{key}"] for key in ("kernel", "targets_V", "weights", "age"))
-    return WindowData(kernel, targets_V, weights, age, Hyperparameters(float(hyper[0]), tuple(map(float, hyper[1:]))))
+    kernel, targets_V, age = (arrays[f"{name}.{key}"] for key in ("kernel", "targets_V", "age"))
+    return WindowData(kernel, targets_V, age, Hyperparameters(float(hyper[0]), tuple(map(float, hyper[1:]))))
 
 
 def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import DehystError
-from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
-from dehyst.adaptive.fleet.snapshot import FleetSnapshot
-from dehyst.adaptive.fleet.state import OUTCOMES
+from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig, FleetSnapshot
+from dehyst.adaptive.fleet.step import OUTCOMES
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.types import BoolArray, FloatArray, MovingPart
 from dehyst.service.answers.guard import Limits, limit

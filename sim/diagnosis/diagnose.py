@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.lapack import one_thread
+from dehyst.adaptive.lssvm import one_thread
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from dehyst.sim.diagnosis.next_experiment import Rival, next_experiment

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
+from dehyst.adaptive.features import gram
 from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
-from dehyst.adaptive.kernels import gram
 from dehyst.adaptive.types import InverseModel
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.types import FloatArray
 
@@ -30,9 +30,8 @@ def samples(n: int = 40, d: int = 3, seed: int = 0) -> tuple[FloatArray, FloatAr
 @given(n=st.integers(6, 30), seed=st.integers(0, 1000))
 def test_solves_the_dual_system(n: int, seed: int) -> None:
     X, y = samples(n, 3, seed)
-    w = np.random.default_rng(seed).random(n) + 0.2
-    model = lssvm.fit(X, y, (0.3, 0.8, 2.0), 50.0, w).model
-    R = kernels.gram(X, None, model.widths) + np.diag(1 / (50.0 * w))
+    model = lssvm.fit(X, y, (0.3, 0.8, 2.0), 50.0).model
+    R = features.gram(X, None, model.widths) + np.eye(n) / 50.0
     np.testing.assert_allclose(R @ model.alpha + model.bias, y, atol=1e-10)
     assert np.sum(model.alpha) == pytest.approx(0.0, abs=1e-8)
 
@@ -51,22 +50,11 @@ def test_reference_values() -> None:
 
 def test_leave_one_out_is_what_it_says() -> None:
     X, y = samples()
-    w = np.linspace(0.3, 2.0, y.size)
-    fit = lssvm.fit(X, y, 0.7, 200.0, w)
+    fit = lssvm.fit(X, y, 0.7, 200.0)
     for i in (0, 17, 39):
         others = np.arange(y.size) != i
-        without = lssvm.fit(X[others], y[others], 0.7, 200.0, w[others]).model
+        without = lssvm.fit(X[others], y[others], 0.7, 200.0).model
         assert fit.leave_one_out()[i] == pytest.approx(y[i] - without.predict(X[i : i + 1])[0], rel=1e-7)
-
-
-def test_an_integer_weight_counts_as_so_many_equal_samples() -> None:
-    X, y = samples(20)
-    w = np.ones(20)
-    w[4] = 3.0
-    weighted = lssvm.fit(X, y, 0.5, 10.0, w).model
-    repeated = lssvm.fit(np.vstack([X, X[[4, 4]]]), np.concatenate([y, y[[4, 4]]]), 0.5, 10.0).model
-    points = np.random.default_rng(1).random((5, 3))
-    np.testing.assert_allclose(weighted.predict(points), repeated.predict(points), rtol=1e-9)
 
 
 def test_inputs_are_not_changed() -> None:
@@ -85,7 +73,6 @@ def test_inputs_are_not_changed() -> None:
         ({"gamma": 0.0}, "gamma"),
         ({"gamma": np.nan}, "gamma"),
         ({"widths": -1.0}, "widths"),
-        ({"weights": np.zeros(40)}, "weights"),
     ],
 )
 def test_bad_input_names_the_field(change: dict[str, object], field: str) -> None:
@@ -107,16 +94,16 @@ def test_singular_systems_are_refused() -> None:
 def test_one_pair_by_hand() -> None:
     x, other, widths = np.array([1.0, 2.0]), np.array([1.5, 1.0]), np.array([0.5, 2.0])
     # (0.5/0.5)² + (1/2)² = 1.25
-    assert kernels.gram(x[None], other[None], widths)[0, 0] == pytest.approx(np.exp(-1.25), rel=1e-15)
+    assert features.gram(x[None], other[None], widths)[0, 0] == pytest.approx(np.exp(-1.25), rel=1e-15)
 
 
 def test_column_and_gram_are_made_of_pairs() -> None:
     rng = np.random.default_rng(1)
     X, other, widths = rng.random((7, 3)), rng.random((4, 3)), np.array([0.3, 1.0, 5.0])
-    K = kernels.gram(X, other, widths)
+    K = features.gram(X, other, widths)
     pairs = [[np.exp(-np.sum(((a - b) / widths) ** 2)) for b in other] for a in X]
     np.testing.assert_allclose(K, pairs, rtol=1e-14)
-    np.testing.assert_allclose(kernels.column(X, other[2], widths), K[:, 2], rtol=1e-14)
+    np.testing.assert_allclose(features.column(X, other[2], widths), K[:, 2], rtol=1e-14)
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (70, 1000), (65, 512), (2, 40_000)])
@@ -126,13 +113,13 @@ def test_gram_is_the_same_however_it_is_cut_into_blocks(n: int, m: int) -> None:
     whole = np.zeros((n, m))
     for j in range(3):
         whole += ((X[:, j, None] - other[None, :, j]) / widths[j]) ** 2
-    np.testing.assert_array_equal(kernels.gram(X, other, widths), np.exp(-whole))
+    np.testing.assert_array_equal(features.gram(X, other, widths), np.exp(-whole))
 
 
 def test_gram_keeps_the_digits_of_near_duplicates() -> None:
     X = np.array([[1e3, 1.0], [1e3 + 1e-9, 1.0]])
     distance = X[1, 0] - X[0, 0]
-    K = kernels.gram(X, None, np.array([1e-6, 1.0]))
+    K = features.gram(X, None, np.array([1e-6, 1.0]))
     assert 1.0 - K[0, 1] == pytest.approx((distance / 1e-6) ** 2, rel=1e-6)
 
 
@@ -141,13 +128,13 @@ def test_exponential_to_two_units_in_the_last_place() -> None:
     t = -np.concatenate([np.abs(rng.standard_normal(20000)) * np.logspace(-8, 2.5, 20000), [0.0, 707.9]])
     t = t[t > -708.0]
     got = t.copy()
-    kernels.exp_negative(got, np.empty_like(got))
+    features.exp_negative(got, np.empty_like(got))
     assert np.max(np.abs(got - np.exp(t)) / np.spacing(np.exp(t))) <= 2.0
 
 
 def test_exponential_at_its_ends() -> None:
     t = np.array([-709.0, -1e300, -np.inf, np.nan, -0.0])
-    kernels.exp_negative(t, np.empty_like(t))
+    features.exp_negative(t, np.empty_like(t))
     np.testing.assert_array_equal(t, [0.0, 0.0, 0.0, np.nan, 1.0])
 
 
@@ -157,25 +144,25 @@ def test_compiled_column_is_the_column(count: int, dimension: int, seed: int) ->
     rng = np.random.default_rng(seed)
     X, x, widths = rng.random((count, dimension)), rng.random(dimension), rng.random(dimension) + 0.1
     out = np.full(count + 2, 7.0)
-    kernels.rbf_column(np.ascontiguousarray((X / widths).T), count, x / widths, out, np.empty(count + 2))
-    np.testing.assert_allclose(out[:count], kernels.column(X, x, widths), rtol=1e-12, atol=1e-300)
+    features.rbf_column(np.ascontiguousarray((X / widths).T), count, x / widths, out, np.empty(count + 2))
+    np.testing.assert_allclose(out[:count], features.column(X, x, widths), rtol=1e-12, atol=1e-300)
     np.testing.assert_array_equal(out[count:], 7.0)
 
 
 @pytest.mark.parametrize("widths", [0.0, -1.0, np.inf, [1.0, 2.0, 3.0], [1.0, np.nan]])
 def test_bad_widths_are_refused(widths: object) -> None:
     with pytest.raises(InputError, match="widths"):
-        kernels.as_widths(widths, 2)
+        features.as_widths(widths, 2)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 7, 500])
 def test_a_column_is_weighed_as_a_sum_and_its_largest(n: int) -> None:
     rng = np.random.default_rng(n)
     k, alpha = rng.random(n), rng.standard_normal(n)
-    total, largest = kernels.weigh(k, alpha)
+    total, largest = features.weigh(k, alpha)
     assert total == pytest.approx(float(alpha @ k), abs=1e-12)
     assert largest == max(k.tolist(), default=0.0)
     for j in range(n):  # wherever it is
         k[j] += 2.0
-        assert kernels.weigh(k, alpha)[1] == k[j]
+        assert features.weigh(k, alpha)[1] == k[j]
         k[j] -= 2.0

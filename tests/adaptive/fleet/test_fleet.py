@@ -9,8 +9,7 @@ import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
-from dehyst.adaptive.fleet.state import OUTCOMES
-from dehyst.adaptive.fleet.step import NO_SAMPLE
+from dehyst.adaptive.fleet.step import NO_SAMPLE, OUTCOMES
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
@@ -276,7 +275,7 @@ def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInvers
 
 @pytest.mark.parametrize("device", ["cpu", "cpu:0"])
 def test_axes_with_kept_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], device: str) -> None:
-    config = LearnerConfig(window=60, eviction="fifo", before_change=0.2, solver=SolverConfig(form="inverse"))
+    config = LearnerConfig(window=60, eviction="fifo", solver=SolverConfig(form="inverse"))
     fleet = Fleet(models, FleetConfig(config, device))
     singles = [Learner(model, config) for model in models]
     u, y = samples(1200)

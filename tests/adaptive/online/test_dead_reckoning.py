@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.dead_reckoning import (
-    CREEP_PER_S,
+from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.track import (
     LOST_SHARE,
     OFF_LINE,
     SLOPES,
@@ -19,7 +19,6 @@ from dehyst.adaptive.online.dead_reckoning import (
     answers,
     mean_slope,
 )
-from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.sim.stage.presets import preset
@@ -83,13 +82,13 @@ def test_no_model_makes_it_run_off(model: LssvmInverse, seed: int, steps: list[f
     u = np.clip(4.0 + np.cumsum(steps), 0.0, 10.0)
     reckoning = Reckoning.begin(wrong, REST, 4.0, np.empty(0), np.empty(0), model.rest_memory(40.0))
     slope = mean_slope(wrong)
-    before, way_V, last, creep = 4.0, 0.0, 0.0, CREEP_PER_S * reckoning.range_um * DT
+    before, way_V, last = 4.0, 0.0, 0.0
     for u_V in u:
         held = reckoning.y_um
         place = reckoning.advance(float(u_V))
-        # In one sample: by the largest slope, by the motion under way, by creep.
+        # In one sample: by the largest slope, by the motion under way.
         caused = np.sign(slope) * (u_V - before) / (SLOPES[0] * abs(slope))
-        assert min(caused, 0.0) + min(last, -creep) - 1e-9 <= place - held <= max(caused, 0.0) + max(last, creep) + 1e-9
+        assert min(caused, 0.0) + min(last, 0.0) - 1e-9 <= place - held <= max(caused, 0.0) + max(last, 0.0) + 1e-9
         last = place - held
         way_V += abs(u_V - before)
         before = u_V

@@ -13,7 +13,6 @@ import pytest
 
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.dead_reckoning import Reckoning
 from dehyst.adaptive.online.gates import GLITCH, AdmissionConfig, EnvelopeConfig
 from dehyst.adaptive.online.glitch_or_jump import (
     LEVEL_STD,
@@ -29,6 +28,7 @@ from dehyst.adaptive.online.glitch_or_jump import (
     level_of,
 )
 from dehyst.adaptive.online.learner import Learner
+from dehyst.adaptive.online.track import Reckoning
 from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample, StateDict
 from dehyst.sim.stage.presets import preset

@@ -14,11 +14,9 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftFilter
 from dehyst.adaptive.online.gates import AdmissionConfig
-from dehyst.adaptive.online.kernel_window import ResidualWindow
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.sim.signals.references import demo_reference
-from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
@@ -348,72 +346,6 @@ def test_what_is_known_of_a_jump_is_part_of_the_state(
         assert learner.handle(sample) == twin.handle(sample)
     assert learner.counters()["jumps"] == 1
     assert np.array_equal(learner.snapshot().beta, twin.snapshot().beta)
-
-
-# --- Samples from before a change of the stage count less.
-
-
-def test_a_bad_weight_is_named() -> None:
-    for bad in (0.0, 1.5, float("nan")):
-        with pytest.raises(InputError, match="before_change"):
-            LearnerConfig(before_change=bad)
-
-
-def filled(model: LssvmInverse, n: int = 10) -> ResidualWindow:
-    """A window of samples too far apart to be each other's neighbours."""
-    window = ResidualWindow(n, model)
-    for k in range(n):
-        window.learn(np.full(model.features.kernel_size, 50.0 * k), 0.01 * k)
-    return window
-
-
-def test_what_is_from_before_a_change_is_let_go_one_a_step(model: LssvmInverse) -> None:
-    window = filled(model)
-    window.let_go(0.05)
-    np.testing.assert_array_equal(window.data().weights, 1.0)
-    window.expect_change()
-    window.learn(np.full(model.features.kernel_size, 50.0 * 6), 1.0)
-    window.let_go(0.05)
-    assert np.count_nonzero(window.data().weights == 0.05) == 1
-    again = ResidualWindow(10, model)
-    again.take(again.read(window.state_dict()))
-    other = window.with_hyperparameters(window.hyper)
-    for held in (window, again, other):
-        for _ in range(20):
-            held.let_go(0.05)
-        # The one that has come since is as it was.
-        np.testing.assert_array_equal(held.data().weights, [0.05] * 6 + [1.0] + [0.05] * 3)
-
-
-def test_where_nothing_has_changed_nothing_more_is_let_go(model: LssvmInverse) -> None:
-    window = filled(model)
-    window.expect_change()
-    window.let_go(0.05)
-    window.keep()
-    for _ in range(20):
-        window.let_go(0.05)
-    assert np.count_nonzero(window.data().weights == 0.05) == 1
-
-
-@pytest.mark.parametrize("before_change", [0.05, 1.0])
-def test_a_change_that_is_found_lets_go_of_the_window(model: LssvmInverse, before_change: float) -> None:
-    """A gain that drops by 6 %: within two seconds all that is left from before counts a twentieth."""
-    at, n = 2000, 4500
-    config = replace(preset("rich", seed=3), changes=((at * STEP_S, {"gain_drift.gain": -0.06}),))
-    u = training_input(STEP_S, 10.0)[1][:n]
-    stage = Stage(config)
-    y, _ = stage.run(stage.initial_state(), u)
-    learner = Learner.from_model(model, LearnerConfig(before_change=before_change))
-    for k in range(n):
-        if k == at:
-            held = learner.window_data()
-            np.testing.assert_array_equal(held.weights, 1.0)
-        learner.handle(Sample(k, k * STEP_S, float(u[k]), float(y[k])))
-    held = learner.window_data()
-    old = held.age > (n - at) / LearnerConfig().learn_every
-    assert old.any()
-    np.testing.assert_array_equal(held.weights[old], before_change)
-    np.testing.assert_array_equal(held.weights[held.age < 100], 1.0)
 
 
 def test_a_kernel_part_of_other_motion_is_given_up_and_a_good_one_kept(model: LssvmInverse) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from dehyst.adaptive.inverse_model import LssvmInverse, track_memory
 from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.online.missing_motion import TURNS, MissingMotion
+from dehyst.adaptive.online.track import TURNS, MissingMotion
 from dehyst.adaptive.types import FloatArray, Sample, StateDict
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.service.identification.identifying import motion_of

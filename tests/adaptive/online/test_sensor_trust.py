@@ -11,7 +11,6 @@ import pytest
 
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.dead_reckoning import Reckoning
 from dehyst.adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from dehyst.adaptive.online.glitch_or_jump import Circumstances
 from dehyst.adaptive.online.learner import Learner
@@ -36,6 +35,7 @@ from dehyst.adaptive.online.sensor_trust import (
     bends_otherwise,
     slope_of,
 )
+from dehyst.adaptive.online.track import Reckoning
 from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import FloatArray, Sample, StateDict
 from dehyst.sim.signals.voltages import training_input

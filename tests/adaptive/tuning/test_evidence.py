@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from dehyst.adaptive import kernels, lssvm
+from dehyst.adaptive import features, lssvm
 from dehyst.adaptive.errors import InputError, NumericsError
 from dehyst.adaptive.tuning import evidence
 from dehyst.adaptive.tuning import search as inference
@@ -29,7 +29,7 @@ def small_problem(n: int = 70) -> evidence.EvidenceSamples:
     rng = np.random.default_rng(3)
     X = rng.random((n, 3))
     y = np.sin(6 * X[:, 0]) + 0.5 * X[:, 1] + 0.05 * rng.standard_normal(n)
-    return evidence.evidence_samples(X, y, rng.random(n) + 0.5)
+    return evidence.evidence_samples(X, y)
 
 
 def level_two(data: evidence.EvidenceSamples, widths: np.ndarray) -> evidence.Evidence:
@@ -86,15 +86,15 @@ def test_third_level_gradient_follows_the_optimum_of_gamma() -> None:
 
 
 def test_effective_parameters_by_eigenvalues() -> None:
-    data = evidence.evidence_samples(*_unweighted())
+    data = evidence.evidence_samples(*_samples())
     widths = np.array([0.5, 0.5, 0.5])
     found = evidence.evaluate(data, 30.0, widths)
     centre = np.eye(data.size) - 1.0 / data.size
-    eigenvalues = np.linalg.eigvalsh(centre @ kernels.gram(data.X, None, widths) @ centre)
+    eigenvalues = np.linalg.eigvalsh(centre @ features.gram(data.X, None, widths) @ centre)
     assert found.effective == pytest.approx(1 + np.sum(30 * eigenvalues / (1 + 30 * eigenvalues)), rel=1e-9)
 
 
-def _unweighted() -> tuple[np.ndarray, np.ndarray]:
+def _samples() -> tuple[np.ndarray, np.ndarray]:
     data = small_problem()
     return data.X, data.y
 
@@ -107,7 +107,7 @@ def test_search_finds_what_matters(method: str) -> None:
     assert widths[2] > 5 * widths[0], "the third feature carries nothing, its width must grow"
     X, y = np.random.default_rng(9).random((300, 3)), None
     y = np.sin(6 * X[:, 0]) + 0.5 * X[:, 1]
-    model = lssvm.fit(data.X, data.y, widths, found.best.gamma, data.weights).model
+    model = lssvm.fit(data.X, data.y, widths, found.best.gamma).model
     assert np.sqrt(np.mean((model.predict(X) - y) ** 2)) < 0.04
 
 
@@ -132,7 +132,7 @@ def test_the_search_is_deterministic() -> None:
 
 
 def test_bad_input() -> None:
-    X, y = _unweighted()
+    X, y = _samples()
     with pytest.raises(InputError, match="equal"):
         evidence.evidence_samples(X, np.ones(y.size))
     with pytest.raises(InputError, match="samples"):
@@ -183,13 +183,13 @@ def test_one_blas_thread_is_used_whatever_the_environment_says(called: str, monk
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
     seen: set[int] = set()
-    real, data, width = kernels.gram, small_problem(n=40), np.ones(3)
+    real, data, width = features.gram, small_problem(n=40), np.ones(3)
 
     def watched(*arguments: Any) -> Any:
         seen.update(threads())
         return real(*arguments)
 
-    monkeypatch.setattr(kernels, "gram", watched)
+    monkeypatch.setattr(features, "gram", watched)
     with threadpool_limits(2, "blas"):
         before = threads()
         if called == "infer":

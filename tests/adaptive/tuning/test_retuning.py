@@ -33,7 +33,7 @@ def truth(X: FloatArray) -> FloatArray:
 def samples(n: int, seed: int, hyper: Hyperparameters = NARROW, noise_V: float = NOISE_V) -> WindowData:
     rng = np.random.default_rng(seed)
     X = rng.uniform(-1.0, 1.0, (n, 2))
-    return WindowData(X, truth(X) + noise_V * rng.normal(size=n), np.ones(n), np.arange(n, 0, -1.0) - 1.0, hyper)
+    return WindowData(X, truth(X) + noise_V * rng.normal(size=n), np.arange(n, 0, -1.0) - 1.0, hyper)
 
 
 def slid(before: WindowData, fresh: WindowData) -> WindowData:
@@ -43,7 +43,6 @@ def slid(before: WindowData, fresh: WindowData) -> WindowData:
         before,
         kernel=np.vstack([before.kernel[k:], fresh.kernel]),
         targets_V=np.concatenate([before.targets_V[k:], fresh.targets_V]),
-        weights=np.ones(before.targets_V.size),
         age=np.concatenate([before.age[k:] + k, fresh.age]),
     )
 
@@ -276,7 +275,7 @@ def test_window_data_is_a_copy_that_travels(state: dict[str, object]) -> None:
     data = pickle.loads(pickle.dumps(learner.window_data()))
     n = len(learner.parts.window)
     assert data.kernel.shape == (n, learner.base.features.kernel_size)
-    assert data.targets_V.shape == data.weights.shape == data.age.shape == (n,)
+    assert data.targets_V.shape == data.age.shape == (n,)
     assert data.age.min() == 0.0
     learner.window_data().targets_V[:] = 0.0
     assert np.any(learner.window_data().targets_V != 0.0)

@@ -13,10 +13,9 @@ from dehyst.adaptive import lssvm
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.window import arrays as ws
-from dehyst.adaptive.window import healing as window_refresh
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status
-from dehyst.adaptive.window.window import Form, Window, WindowConfig
+from dehyst.adaptive.window.window import Form, Window, WindowConfig, begin_refresh
 from tests.adaptive.window.windows import CAPACITY, GAMMA, WIDTHS, filled, forms, sample
 
 HELD = 12
@@ -37,7 +36,7 @@ def at_work(form: Form, n: int = HELD) -> Window:
 def held(window: Window) -> list[np.ndarray]:
     """What a window holds and answers."""
     answers = [window.predict(POINT), window.scale, window.bias, float(window.arrays.F[ws.GRAM])]
-    return [window.X, window.y, window.weights, window.alpha, np.array(answers)]
+    return [window.X, window.y, window.alpha, np.array(answers)]
 
 
 def assert_same(window: Window, before: list[np.ndarray]) -> None:
@@ -53,7 +52,7 @@ def assert_finite(window: Window) -> None:
 
 def assert_exact(window: Window) -> None:
     """As the direct solver, in units of the samples at hand, which may be huge."""
-    fit = lssvm.fit(window.X, window.y, WIDTHS, GAMMA, window.weights)
+    fit = lssvm.fit(window.X, window.y, WIDTHS, GAMMA)
     size = np.max(np.abs(fit.model.alpha))
     np.testing.assert_allclose(window.alpha, fit.model.alpha, rtol=1e-7, atol=1e-8 * size)
     mean = float(fit.model.predict(POINT[None])[0])
@@ -66,7 +65,7 @@ def refused(window: Window) -> int:
 
 def refresh_around(window: Window, value: float) -> bool:
     """An extreme step while a refresh is open."""
-    refresh = window_refresh.begin(window)
+    refresh = begin_refresh(window)
     window.replace(1, POINT, value)
     refresh.factor()
     return refresh.finish()
@@ -80,10 +79,7 @@ def steps_with(value: float) -> Iterator[tuple[str, Step]]:
         yield f"append x{i}", lambda w, x=x: w.append(x, 1.0)  # type: ignore[misc]
         yield f"replace x{i}", lambda w, x=x: w.replace(3, x, 1.0)  # type: ignore[misc]
     yield "append y", lambda w: w.append(POINT, value)
-    yield "append w", lambda w: w.append(POINT, 1.0, value)
     yield "replace y", lambda w: w.replace(2, POINT, value)
-    yield "replace w", lambda w: w.replace(2, POINT, 1.0, value)
-    yield "reweight", lambda w: w.reweight(4, value)
     yield "refresh", lambda w: refresh_around(w, value)
 
 
@@ -109,11 +105,7 @@ def test_what_is_no_number_or_beyond_all_measure_is_refused(form: Form) -> None:
     beyond = (np.inf, -np.inf, np.nan, 1e308, -1e308, 1e200, -1e200, 1e100, 1e10)
     for value in beyond:
         for name, step in steps_with(value):
-            if name not in ("refresh", "append w", "replace w", "reweight"):
-                assert step(at_work(form)) is Status.BAD_INPUT, (name, value)
-    for value in (np.inf, np.nan, 1e308, 1e200, 1e-320, 0.0, -1.0, -np.inf):
-        for name, step in steps_with(value):
-            if name in ("append w", "replace w", "reweight"):
+            if name != "refresh":
                 assert step(at_work(form)) is Status.BAD_INPUT, (name, value)
 
 
@@ -128,14 +120,6 @@ def test_the_limits_themselves_are_taken(form: Form) -> None:
         assert window.replace(HELD, *sample(np.random.default_rng(5))) is Status.ACCEPTED
         assert steps.refine(window.arrays)
         assert_exact(window)
-    for weight in (1.000001 * ws.LEAST_PRECISION / GAMMA, 1e-9, 1e6):
-        window = at_work(form)
-        assert window.reweight(3, weight) is Status.ACCEPTED
-        assert_exact(window)
-        assert window.reweight(3, 1.0) is Status.ACCEPTED
-        assert_exact(window)
-        assert window.append(POINT, 1.0, weight) is Status.ACCEPTED
-        assert_exact(window)
 
 
 @forms
@@ -143,7 +127,7 @@ def test_the_limits_themselves_are_taken(form: Form) -> None:
 @given(seed=st.integers(0, 10_000), data=st.data())
 def test_any_mixture_of_good_and_extreme_steps(form: Form, seed: int, data: st.DataObject) -> None:
     rng, window = np.random.default_rng(seed), filled(form)
-    # A weight of 1e10 on two equal samples makes a matrix that no inverse in double precision is exact for.
+    # Equal samples make a matrix that no inverse in double precision is exact for.
     hardest = window.condition()
     for _ in range(data.draw(st.integers(1, 12))):
         before, count, n = held(window), refused(window), len(window)
@@ -152,11 +136,10 @@ def test_any_mixture_of_good_and_extreme_steps(form: Form, seed: int, data: st.D
             status = steps[data.draw(st.integers(0, len(steps) - 1))][1](window) if n > 8 else Status.NO_SLOT
         else:
             slot = int(rng.integers(n))
-            status = data.draw(st.sampled_from(["replace", "append", "reweight"]))  # type: ignore[assignment]
+            status = data.draw(st.sampled_from(["replace", "append"]))  # type: ignore[assignment]
             good: dict[str, Callable[[], Status]] = {
                 "replace": lambda slot=slot: window.replace(slot, *sample(rng)),  # type: ignore[misc]
                 "append": lambda: window.append(*sample(rng)),
-                "reweight": lambda slot=slot: window.reweight(slot, float(rng.random() + 0.1)),  # type: ignore[misc]
             }
             status = good[str(status)]()
         assert_finite(window)
@@ -173,7 +156,7 @@ def test_any_mixture_of_good_and_extreme_steps(form: Form, seed: int, data: st.D
 
 
 @forms
-@pytest.mark.parametrize("name", ["replace", "append", "reweight"])
+@pytest.mark.parametrize("name", ["replace", "append"])
 def test_a_worn_out_factorisation_refuses_and_keeps_all(form: Form, name: str) -> None:
     """P (or its factor) spoilt where the step must notice: refused, counted, and all as before to the last bit."""
     window = at_work(form)
@@ -181,19 +164,16 @@ def test_a_worn_out_factorisation_refuses_and_keeps_all(form: Form, name: str) -
     A = window.arrays
     # What every one of these steps multiplies by; the solution itself is still good.
     A.P[: len(window), : len(window)] = np.nan
-    kept, count = [window.alpha, np.array(window.bias), window.X, window.y, window.weights], refused(window)
+    kept, count = [window.alpha, np.array(window.bias), window.X, window.y], refused(window)
     rng = np.random.default_rng(2)
     possible: dict[str, Step] = {
         "replace": lambda w: w.replace(4, *sample(rng)),
         "append": lambda w: w.append(*sample(rng)),
-        "reweight": lambda w: w.reweight(4, 0.5),
     }
     with np.errstate(invalid="ignore"):
         assert possible[name](window) is Status.ILL_CONDITIONED
         assert refused(window) == count + 1
-        for got, before in zip(
-            [window.alpha, np.array(window.bias), window.X, window.y, window.weights], kept, strict=True
-        ):
+        for got, before in zip([window.alpha, np.array(window.bias), window.X, window.y], kept, strict=True):
             np.testing.assert_array_equal(got, before)
     window.rebuild()
     assert window.replace(4, *sample(rng)) is Status.ACCEPTED
@@ -273,8 +253,8 @@ def test_a_refactorisation_that_fails_changes_nothing_not_even_the_form() -> Non
 def test_a_window_is_not_made_of_what_a_step_would_refuse() -> None:
     X, y = np.random.default_rng(0).random((6, 3)), np.arange(6.0)
     config = WindowConfig(CAPACITY, WIDTHS, GAMMA)
-    for change in ({"X": X * 1e12}, {"y": y * 1e200}, {"weights": np.full(6, 1e-320)}, {"weights": np.full(6, np.inf)}):
-        with pytest.raises(InputError, match="X, y, weights"):
+    for change in ({"X": X * 1e12}, {"y": y * 1e200}):
+        with pytest.raises(InputError, match="X, y: got values"):
             Window.from_samples(config, **{"X": X, "y": y, **change})
     with pytest.raises(InputError, match="gamma"):
         WindowConfig(CAPACITY, WIDTHS, 1e16)

@@ -17,8 +17,7 @@ from dehyst.adaptive.types import FloatArray
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import Status, handle_of
-from dehyst.adaptive.window.healing import begin
-from dehyst.adaptive.window.window import Form, SolverState, Window, WindowConfig
+from dehyst.adaptive.window.window import Form, SolverState, Window, WindowConfig, begin_refresh
 from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
 
 # --- The sliding window in both forms, against the direct solver and against itself.
@@ -65,21 +64,19 @@ def test_growing_from_empty_is_exact_at_every_size(form: Form) -> None:
 @pytest.mark.parametrize("slot", range(0, CAPACITY, 4))
 def test_every_slot_can_be_replaced(form: Form, slot: int) -> None:
     window = filled(form)
-    x, y, w = sample(np.random.default_rng(8))
-    assert window.replace(slot, x, y, w) is Status.ACCEPTED
+    x, y = sample(np.random.default_rng(8))
+    assert window.replace(slot, x, y) is Status.ACCEPTED
     np.testing.assert_array_equal(window.X[slot], x)
-    assert (window.y[slot], window.weights[slot]) == (y, w)
+    assert window.y[slot] == y
     assert_exact(window)
 
 
 @forms
 def test_slots_that_do_not_exist(form: Form) -> None:
     window = filled(form, n=5)
-    x, y, w = sample(np.random.default_rng(1))
+    x, y = sample(np.random.default_rng(1))
     for slot in (-1, 5, 1000):
-        assert window.replace(slot, x, y, w) is Status.NO_SLOT
-        assert window.reweight(slot, 1.0) is Status.NO_SLOT
-    assert window.reweight(0, -1.0) is Status.BAD_INPUT
+        assert window.replace(slot, x, y) is Status.NO_SLOT
     assert_exact(window)
 
 
@@ -101,7 +98,7 @@ def test_the_order_of_samples_does_not_matter(seed: int) -> None:
 @forms
 def test_from_samples_and_rebuild(form: Form) -> None:
     grown = filled(form)
-    made = Window.from_samples(grown.config, grown.X, grown.y, grown.weights)
+    made = Window.from_samples(grown.config, grown.X, grown.y)
     np.testing.assert_allclose(made.alpha, grown.alpha, rtol=1e-7, atol=1e-9)
     rng = np.random.default_rng(3)
     for k in range(40):
@@ -232,14 +229,14 @@ def test_singular_samples_leave_the_window_as_it_was() -> None:
 def test_leave_one_out_is_what_it_says_for_every_sample(form: Form) -> None:
     """Against a fit without the sample, for all of them, at every step of a window at work."""
     window, rng = filled(form, CAPACITY - 3), np.random.default_rng(11)
-    steps = ["replace", "replace", "append", "reweight", "append", "replace", "reweight"]
+    steps = ["replace", "replace", "append", "append", "replace"]
     for name in [*steps, *["replace"] * (CAPACITY + 2)]:
         STEPS[name](window, rng)
-        X, y, w, n = window.X, window.y, window.weights, len(window)
+        X, y, n = window.X, window.y, len(window)
         found = window.leave_one_out()
         for i in range(n):
             rest = np.arange(n) != i
-            without = lssvm.fit(X[rest], y[rest], WIDTHS, GAMMA, w[rest]).model
+            without = lssvm.fit(X[rest], y[rest], WIDTHS, GAMMA).model
             assert found[i] == pytest.approx(y[i] - without.predict(X[i : i + 1])[0], rel=1e-7, abs=1e-9), (name, i)
 
 
@@ -345,7 +342,7 @@ def test_arrays_of_another_kind_are_refused() -> None:
 
 def test_after_a_refresh_the_new_arrays_answer() -> None:
     window, X, y = made()
-    refresh = begin(window)
+    refresh = begin_refresh(window)
     window.replace(7, X[71], float(y[71]))
     refresh.factor()
     assert refresh.finish()

@@ -39,7 +39,7 @@ def window_data(n: int, seed: int = 1) -> WindowData:
     rng = np.random.default_rng(seed)
     X = rng.uniform(-1.0, 1.0, (n, 2))
     target_V = 0.1 * np.sin(3.0 * X[:, 0]) + 0.05 * np.tanh(4.0 * X[:, 1]) + 0.7 + 0.004 * rng.normal(size=n)
-    return WindowData(X, target_V, np.ones(n), np.arange(n, 0, -1.0) - 1.0, NARROW)
+    return WindowData(X, target_V, np.arange(n, 0, -1.0) - 1.0, NARROW)
 
 
 def order(search: RetuneConfig) -> dict[str, Any]:
