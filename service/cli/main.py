@@ -120,7 +120,7 @@ COMMANDS: Final[dict[str, Command]] = {
         "dehyst.service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"
     ),
     "access": _command(
-        "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
+        "access", OPERATING, "make the certificates and access rules for more than one machine"
     ),
     "commission": Command(
         "dehyst.service.commissioning.command",

@@ -1,7 +1,7 @@
 """A router, two service hosts and a lab host with stages and clients; one service host is lost in the middle.
 
 ``python -m tests.e2e.scale_drill FOLDER [--processes]`` does it and prints one line of JSON. With namespaces it is to
-be run inside ``unshare -rn``, where it is the root of a network of its own. Everything speaks TLS with passwords and
+be run inside ``unshare -rn``, where it is the root of a network of its own. Everything speaks TLS with
 access control, made by the project's own command, because that is what ``dehyst serve`` asks for beyond loopback.
 """
 
