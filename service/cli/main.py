@@ -119,9 +119,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "epics": Command(
         "dehyst.service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"
     ),
-    "access": _command(
-        "access", OPERATING, "make the certificates and access rules for more than one machine"
-    ),
+    "access": _command("access", OPERATING, "make the certificates and access rules for more than one machine"),
     "commission": Command(
         "dehyst.service.commissioning.command",
         IDENTIFICATION,
