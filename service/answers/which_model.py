@@ -259,7 +259,8 @@ def _best(models: Sequence[InverseModel | None], recent: FloatArray) -> InverseM
 
 def _error_V(model: InverseModel, recent: FloatArray) -> float:
     try:
-        u_V = model.feedforward(*recent[:3], model.rest_memory(float(recent[0, 0]))).u_V
+        y_um, v_um_per_s, a_um_per_s2, _ = recent
+        u_V = model.feedforward(y_um, v_um_per_s, a_um_per_s2, model.rest_memory(float(y_um[0]))).u_V
     except Exception as error:
         log_model_error(model, error)
         return math.inf
