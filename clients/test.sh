@@ -45,6 +45,7 @@ if [ -z "${DEHYST_TEST_ZENOH:-}" ]; then
 fi
 echo "test-clients: the zenoh follower, beside a live service"
 cd zenoh
+cargo test --release --quiet --test authenticators
 cargo build --release --quiet --lib --examples
 zenoh="${CARGO_TARGET_DIR:-target}/release"
 # shellcheck disable=SC2086

@@ -19,7 +19,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum, StrEnum
 from itertools import groupby
 from typing import Annotated, Final, NamedTuple
@@ -68,6 +68,7 @@ class Kept(Enum):
     NEWEST = "the learner's newest"
     GOOD = "the last that was served"
     OLDER = "one served 0.5 to 1 s before"
+    BEST = "of the newest, one from before and the identified the one with the smallest error on the last readings"
 
 
 class Rule(NamedTuple):
@@ -94,10 +95,12 @@ NOTHING_LEARNT: Final = "nothing_learnt"
 _FINE: Final = Rule(Answering.LEARNT, Kept.NEWEST)
 _WRONG: Final = Rule(Answering.LAST_GOOD, Kept.OLDER, teaches=False, returns=True)
 _UNFIT: Final = Rule(Answering.LAST_GOOD, Kept.GOOD)
+#: Fewest readings by which models are compared.
+_FEWEST: Final = 10
 #: By trouble; "" is none. Troubles that are not here, of the disk or of lost samples, change no model.
 RULES: Final[Mapping[str, Rule]] = {
     "": _FINE,
-    NOTHING_LEARNT: _FINE,
+    NOTHING_LEARNT: Rule(Answering.LAST_GOOD, Kept.BEST),
     SENSOR_FROZEN: _WRONG,
     SAMPLES_POISONED: _WRONG,
     "sensor_stuck": _WRONG,
@@ -169,21 +172,23 @@ class ModelChoice:
 
     def choose(
         self, now: int, candidate: InverseModel | None, identified: InverseModel | None, found: str = "",
-        distrusts: bool = False,
+        distrusts: bool = False, recent: Callable[[], FloatArray] = lambda: np.empty((4, 0)),
     ) -> InverseModel | None:  # fmt: skip
         """The model to serve: ``candidate`` or one from before; None: keep the present one. Once per snapshot.
 
         ``now`` : count of samples. ``candidate`` : the newest model, None if the learner has failed. ``identified`` :
         the one that it began with. ``found`` : what is wrong with samples or learner. ``distrusts`` : whether the
-        learner has the sensor on trial.
+        learner has the sensor on trial. ``recent`` : returns (4, n), y, v, a and u of the last readings.
         """
         elapsed, self._seen = now - self._seen, now
-        if rule_of(found).kept is Kept.NEWEST:
+        if rule_of(found).kept in (Kept.NEWEST, Kept.BEST):
             found = self._trouble_of_model(candidate, identified) or found
         if found:
             self._clean = 0
             if found != self.trouble:
                 self._enter(found, now)
+                if self.rule.kept is Kept.BEST:
+                    self.good = _best((candidate, self._mark, identified), recent())
         elif self.trouble:
             self._clean += elapsed
             if self._clean * self._dt_s >= RECOVER_S:
@@ -241,6 +246,26 @@ class ModelChoice:
     def keep(self, models: Mapping[str, InverseModel]) -> None:
         """Continue with the kept ``models`` of a saved choice, by role."""
         self.good, self._mark, self._next_mark = (models.get(role) for role in ROLES)
+
+
+def _best(models: Sequence[InverseModel | None], recent: FloatArray) -> InverseModel | None:
+    """Of ``models`` the one with the smallest error on the readings (4, n), the first of equals or with too few."""
+    errors_V = [
+        math.inf if model is None else _error_V(model, recent) if recent.shape[1] >= _FEWEST else 0.0
+        for model in models
+    ]
+    return models[int(np.argmin(errors_V))]
+
+
+def _error_V(model: InverseModel, recent: FloatArray) -> float:
+    try:
+        y_um, v_um_per_s, a_um_per_s2, _ = recent
+        u_V = model.feedforward(y_um, v_um_per_s, a_um_per_s2, model.rest_memory(float(y_um[0]))).u_V
+    except Exception as error:
+        log_model_error(model, error)
+        return math.inf
+    error_V = float(np.mean(np.abs(u_V - recent[3])))
+    return error_V if math.isfinite(error_V) else math.inf
 
 
 def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:

@@ -112,7 +112,7 @@ _HELP: Final = {
         "retune": "tune the learning model's hyper-parameters anew, in the background",
         "ask-diagnosis": "let a running service diagnose its recent samples, in the background",
         "epics": "show an axis as EPICS process variables, and take commands",
-        "access": "make the certificates, passwords and access rules for more than one machine",
+        "access": "make the certificates and access rules for more than one machine",
     },
     IDENTIFICATION: {
         "commission": "move a stage through its adapter, and identify it",

@@ -24,7 +24,7 @@ _SHARED: Final[dict[str, dict[str, Any]]] = {
         "type": float, "default": 0.0, "metavar": "S",
         "help": "how long to wait for the endpoint to come up, s (%(default)s)",
     },
-    "zenoh-config": {"type": Path, "metavar": "FILE", "help": "zenoh's own configuration, for TLS and passwords"},
+    "zenoh-config": {"type": Path, "metavar": "FILE", "help": "zenoh's own configuration, for TLS"},
     "key": {
         "metavar": "FILE",
         "help": "the key that 'dehyst serve' prints, where it is not this user's own; -: check nothing (DEHYST_KEY)",

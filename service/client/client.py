@@ -435,7 +435,7 @@ class Client:
         ----------
         timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
         wait_s : time to wait for the service to start, s.
-        zenoh_config : configuration file of zenoh with TLS and passwords (docs/access.md); None without.
+        zenoh_config : configuration file of zenoh with TLS (docs/access.md); None without.
         key : file with the key of the service (docs/access.md); None: the one of this user on this machine, or without
             one nothing is checked.
 

@@ -148,7 +148,7 @@ class ServeConfig:
     zenoh_config: Annotated[
         Path | None,
         Setting(
-            help="TLS, passwords and access control for other machines, from 'dehyst access init'",
+            help="TLS and access control for other machines, from 'dehyst access init'",
             example="service.json5",
         ),
     ] = None

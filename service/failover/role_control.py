@@ -5,6 +5,7 @@ A thread of its own decides when claims change: callbacks of zenoh only store wh
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -13,13 +14,11 @@ from typing import Any, Final
 import zenoh
 
 from dehyst.adaptive.errors import DehystError, ModelFileError
-from dehyst.service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from dehyst.service.failover.state_transfer import fetch_state, status_of
+from dehyst.service.failover.standby_model import StandbyModel
+from dehyst.service.failover.state_transfer import HELD, fetch_state, status_of
 from dehyst.service.operating.server import FREEZE, THAW
-from dehyst.service.operating.verbs import MAX_WHO
-from dehyst.service.protocol.container import fields_of
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.security.authenticator import NO_KEY, Authenticator, payload_of
+from dehyst.service.security.authenticator import NO_KEY, Authenticator
 from dehyst.service.security.tokens import Claim, Tokens
 from dehyst.service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
@@ -73,7 +72,7 @@ class Claims(Tokens[Claim]):
 _ROUTER_LOSS_KNOWN_S: Final = 0.02
 #: Time from a reconnection until the claims behind the router are known, s.
 _CLAIMS_KNOWN_S: Final = 0.5
-#: Longest wait for a part of the state, and pause before the next attempt, s.
+#: Longest wait for the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
 #: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
@@ -95,7 +94,6 @@ class RoleControl:
     ----------
     server : of the axis; it listens already. search_s : time to look for a serving instance before serving, s.
     behind_routers : others reach this instance through routers only: it listens nowhere.
-    peer_files : checkpoints and recordings of the other instance on this host.
 
     Attributes
     ----------
@@ -109,7 +107,6 @@ class RoleControl:
         server: AxisServer,
         search_s: float,
         behind_routers: bool,
-        peer_files: PeerFiles,
     ) -> None:
         self.server = server
         self.claims = Claims(server.keys, server.instance, server.authenticator)
@@ -118,7 +115,6 @@ class RoleControl:
         self.model = StandbyModel(
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
-        self._peer_files = peer_files
         self._behind_routers = behind_routers
         self._unconnected_at = -_CLAIMS_KNOWN_S
         self._refusal = ""
@@ -127,8 +123,8 @@ class RoleControl:
         self._stopping = False
         #: Whether the state of the serving instance must be fetched.
         self._outdated = True
-        #: The last *freeze* or *thaw* of the one that serves, and by whom, until a state from it includes it.
-        self._switch: tuple[str, str] | None = None
+        #: Those who wait for this instance to hold a verb of an operator. Held as long as they are here.
+        self._waiting: list[zenoh.Query] = []
         self._token: Any = None
         self._rival_at: float | None = None
         self._queryable: Any = None
@@ -156,26 +152,17 @@ class RoleControl:
         if self._queryable is not None:
             self._queryable.undeclare()
             self._queryable = None
+        self._waiting.clear()
         self._drop_claim()
 
     def _on_switch(self, query: zenoh.Query) -> None:
-        """An operator has changed the model that is served: fetch its state. A freeze or thaw must hold even if the
-        instance that serves dies before its state has come."""
-        with query:
-            key, by_key, highest = self.server.keys.switch, self.server.authenticator, self.claims.highest()
-            if self.server.role == PRIMARY or highest is None or not by_key.is_asked_by_ours(query, key):
-                return  # the sender counts those who confirm
-            said = fields_of(payload_of(query.payload))
-            verb, by, samples = said.get("verb"), said.get("by"), said.get("samples")
-            if said.get("instance") != highest.instance or not isinstance(by, str) or not isinstance(samples, int):
-                return
-            if samples < self.model.state_samples:
-                return  # told again by somebody: the state that came since includes it, and what followed
-            if verb in (FREEZE, THAW):
-                self._switch = verb, by[:MAX_WHO]
+        """An operator has changed the state that is served: answer once this instance has taken it anew. A verb must
+        hold even if the instance that serves dies right after."""
+        if self.server.role == STANDBY and self.server.authenticator.is_asked_by_ours(query, self.server.keys.switch):
+            self._waiting.append(query)
             self._refetch_state()
-            if verb in (FREEZE, THAW):
-                query.reply(key, held := b"held", attachment=by_key.answered(query, key, held))
+        else:
+            query.drop()  # the sender counts those who confirm
 
     def _refetch_state(self) -> None:
         self._outdated = True
@@ -296,11 +283,10 @@ class RoleControl:
     def _take_over(self) -> None:
         server = self.server
         self._claim()
-        if self._switch is not None:  # before anybody is answered
-            server.loop.queue.call(self._apply_switch, _CHANGE_S, urgent=True)
         server.serve()
         server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
+        self._waiting.clear()
         server.set_synced(True)
         self.settled.set()
         self.ready.set()
@@ -316,26 +302,21 @@ class RoleControl:
         server.loop.queue.call(self._enter_standby, _CHANGE_S)
         self._take_state(other)
 
-    def _apply_switch(self) -> None:
-        """Freeze or thaw as the one before did last, if that was not yet in a state from it: it was answered."""
-        if self._switch is not None:
-            verb, by = self._switch
-            self.server.axis.set_frozen(verb == FREEZE, by)
-
     def _leave_standby(self) -> None:
-        axis, stage = self.server.axis, self.server.keys.stage
-        # In the first epoch there is no other state to take over: continue from its own.
-        files = self._peer_files if self.server.epoch > 1 else PeerFiles()
-        source = self.model.take_over(lambda newest_seq: restore_from_peer(axis, files, stage, newest_seq))
-        self._apply_switch()  # once more: another state may have been restored
-        self._switch = None
+        axis, source = self.server.axis, self.model.take_over()
         self.server.loop.set_gate(None)
-        if self.server.epoch > 1:
+        if self.server.epoch > 1:  # in the first one there is no other state
+            if source:
+                axis.warnings["not_synced"] = (
+                    f"took over without the state of the one before: it continues from {source}, and does not know "
+                    "what operators have commanded since"
+                )
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"
             axis.note("took_over", f"as number {self.server.epoch}, {model}", synced=not source)
 
     def _enter_standby(self) -> None:
         self.model.stand_down()
+        self.server.axis.warnings.pop("not_synced", None)
         self.server.leave_tuning()
         self.server.loop.set_gate(self.model.gate)
 
@@ -343,6 +324,8 @@ class RoleControl:
         """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
         server, taken = self.server, False
         self._outdated = False  # a callback may set it again meanwhile
+        waiting, self._waiting = self._waiting, []
+        frozen = server.axis.frozen
         try:
             wanted = self._while_alive(serving)
             data = fetch_state(self._session, server.keys.state, _TRANSFER_S, server.authenticator, wanted)
@@ -362,8 +345,15 @@ class RoleControl:
         finally:
             if not taken:
                 self._outdated = True
-        if not self._outdated:  # no verb came while it was sent
-            self._switch = None
+                self._waiting = waiting + self._waiting
+        if server.axis.frozen != frozen:  # a start from its own files must know it
+            verb, samples = FREEZE if server.axis.frozen else THAW, server.axis.sequence.received
+            entry = {"who": serving.instance, "verb": verb, "instance": server.instance, "ok": True, "samples": samples}
+            server.journal().write(entry)
+        key, by_key = server.keys.switch, server.authenticator
+        for query in waiting:
+            with contextlib.suppress(zenoh.ZError), query:
+                query.reply(key, HELD, attachment=by_key.answered(query, key, HELD))
         self._refusal = ""
         server.set_synced(True)
         self.ready.set()

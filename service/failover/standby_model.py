@@ -9,88 +9,28 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from dehyst.service.operating.server import Journal
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
-from dehyst.service.storage.checkpoint import (
-    CheckpointFolder,
-    CheckpointMeta,
-    decode_checkpoint,
-    learn_again,
-    restore_newest,
-)
-from dehyst.service.storage.segments import rows_behind
+from dehyst.service.storage.checkpoint import decode_checkpoint, learn_again
 
 if TYPE_CHECKING:
     from dehyst.service.storage.recorder import Recorder
 
-# --- Checkpoints and recordings of the other instance on the same host, from which a standby can take over.
-#
-# A standby that must take over before it has received the state of the serving instance continues from the newest
-# readable checkpoint of the two, and learns the samples in the journal behind it.
-
 _STANDBY_SUFFIX: Final = "-standby"
-_WHOSE: Final = " of the other instance"
-
-
-@dataclass(frozen=True, slots=True)
-class PeerFiles:
-    """Folders of one axis of the other instance; None if it does not write them."""
-
-    checkpoints: Path | None = None
-    recordings: Path | None = None
+#: Samples kept in memory, to be learnt after an older state.
+KEPT_SAMPLES: Final = 30_000
+#: Verdict in a recording of samples that arrived before the standby had a state.
+NOT_SYNCED: Final = "not_synced"
 
 
 def standby_folder(folder: Path | None) -> Path | None:
     """The folder of the standby that corresponds to ``folder`` of the other instance."""
     return None if folder is None else folder.with_name(folder.name + _STANDBY_SUFFIX)
-
-
-def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int) -> str:
-    """Restore ``axis`` from ``files`` if they reach further than its own state.
-
-    ``newest_seq`` : number of the newest sample that has arrived, -1 for none. Returns what was restored, in words; ""
-    for nothing.
-    """
-    if files.checkpoints is None:
-        return ""
-    config = axis.config
-    folder = CheckpointFolder(
-        files.checkpoints, stage, config.name, axis.dt_s, axis.identified, config.checkpoints_kept
-    )
-
-    def reaches_further(meta: CheckpointMeta) -> bool:
-        rows = None if files.recordings is None else rows_behind(files.recordings, meta.samples, axis.owner)
-        last_seq, count = (meta.seq, 0) if rows is None else (int(rows.seq[-1]), len(rows))
-        return _further((last_seq, meta.samples + count), axis, newest_seq)
-
-    switch = Journal(files.recordings or files.checkpoints).last_switch()
-    number = restore_newest(axis, folder, files.recordings, switch, _WHOSE, reaches_further)
-    return "" if number is None else f"checkpoint {number}{_WHOSE} and its journal, sample {axis.handled_seq}"
-
-
-def _further(theirs: tuple[int, int], axis: Axis, newest_seq: int) -> bool:
-    """Whether a state up to (sample number, count of samples) is newer than that of ``axis``.
-
-    Sample numbers decide, unless the stage has restarted its count since; then the counts of samples decide.
-    """
-    own = axis.handled_seq, axis.sequence.received
-    comparable = newest_seq < 0 or max(theirs[0], own[0]) <= newest_seq
-    return theirs > own if comparable else theirs[1] > own[1]
-
-
-# --- Model of a standby.
-
-#: Samples kept in memory, to be learnt after an older state.
-KEPT_SAMPLES: Final = 30_000
-#: Verdict in a recording of samples that arrived before the standby had a state.
-NOT_SYNCED: Final = "not_synced"
 
 
 class StandbyModel:
@@ -105,7 +45,6 @@ class StandbyModel:
     Attributes
     ----------
     synced : True if the axis holds the model of the serving instance.
-    state_samples : count of all samples that the last received state includes.
     """
 
     def __init__(
@@ -117,14 +56,13 @@ class StandbyModel:
         on_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self.synced = False
-        self.state_samples = 0
         self._axis = axis
         self._sink = sink
         self._kept = kept
         self._on_restored = on_restored
         self._on_gap = on_gap
-        #: Last sample of the received state while no sample after it has been learnt; else -1.
-        self._state_seq = -1
+        #: The last sample that has arrived, and the last one of the received state while none after it has; else -1.
+        self._last_seq = self._state_seq = -1
         self._recent: deque[SampleBatch] = deque()
         self._count = 0
         #: Whether samples were dropped from memory before they were learnt.
@@ -137,9 +75,9 @@ class StandbyModel:
         while self._count > self._kept and len(self._recent) > 1:
             self._count -= len(self._recent.popleft())
             self._overflowed |= not self.synced
+        last_seq, self._last_seq = self._last_seq, int(batch.seq[-1])
         if self.synced:
-            self._check_gap([batch])
-            return batch
+            return self._behind_state(batch, last_seq)
         if self._sink is not None:
             self._sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, NOT_SYNCED)
         return None
@@ -155,29 +93,25 @@ class StandbyModel:
         axis.restore(state)
         self.synced = True
         self._overflowed = False
-        self._state_seq, self.state_samples = meta.seq, meta.samples
-        newer = newer_than(list(self._recent), meta.seq)
-        self._check_gap(newer)
-        for batch in newer:  # all of them are in the recording already
+        self._state_seq = meta.seq
+        for batch in newer_than(list(self._recent), meta.seq):  # all of them are in the recording already
+            self._note_gap(batch)
             axis.handle(batch)
         self._rebase()
 
-    def take_over(self, restore: Callable[[int], str] = lambda _: "") -> str:
-        """Serve from now on: without a received state, continue from the best state there is and learn the samples.
+    def take_over(self) -> str:
+        """Serve from now on: without a received state, continue from its own state and learn the samples since.
 
-        ``restore`` gets the number of the newest sample; it may restore the axis and returns from what, in words, or
-        "". Returns from what this instance continues, in words; "" if it held the state of the serving instance.
+        Returns from what this instance continues, in words; "" if it held the state of the serving instance.
         """
         if self.synced:
             return ""
         self.synced = True
         axis = self._axis
-        restored = restore(int(self._recent[-1].seq[-1]) if self._recent else -1)
-        source = restored or f"its own state of sample {axis.handled_seq}"
-        if self._overflowed and not restored:
-            learn_again(axis, axis.config.recorder)
+        source = f"its own state of sample {axis.handled_seq}" if axis.handled_seq >= 0 else "the model file"
         unlearnt = list(self._recent)
-        if restored or self._overflowed:
+        if self._overflowed:
+            learn_again(axis, axis.config.recorder)
             unlearnt = newer_than(unlearnt, axis.handled_seq)
         for batch in unlearnt:
             axis.handle(batch)
@@ -188,17 +122,30 @@ class StandbyModel:
     def stand_down(self) -> None:
         """Wait for a state again: another instance serves."""
         self.synced = self._overflowed = False
-        self.state_samples = 0
         self._recent.clear()
         self._count = 0
 
-    def _check_gap(self, batches: list[SampleBatch]) -> None:
-        """A sample in transit while the state was copied may be neither in the state nor among the samples after it."""
-        if self._state_seq < 0 or not batches:
-            return
-        first, state_seq = int(batches[0].seq[0]), self._state_seq
-        self._state_seq = -1
-        if first > state_seq + 1:
+    def _behind_state(self, batch: SampleBatch, last_seq: int) -> SampleBatch | None:
+        """The samples of ``batch`` that the received state does not include: it may overtake its last samples.
+
+        Those go on from ``last_seq``, the last sample that arrived before; others are of a stage that began anew.
+        """
+        if self._state_seq < 0:
+            return batch
+        included = (batch.seq > last_seq) & (batch.seq <= self._state_seq)
+        before = batch.where(included)
+        if self._sink is not None and len(before):
+            self._sink.put_aside(before.seq, before.t_s, before.u_V, before.y_um, NOT_SYNCED)
+        batch = batch.where(~included)
+        if not len(batch):
+            return None
+        self._note_gap(batch)
+        return batch
+
+    def _note_gap(self, batch: SampleBatch) -> None:
+        """A sample in transit while the state was copied may be neither in the state nor among those after it."""
+        first, state_seq, self._state_seq = int(batch.seq[0]), self._state_seq, -1
+        if 0 <= state_seq < first - 1:
             self._on_gap()
 
     def _rebase(self) -> None:

@@ -171,7 +171,7 @@ class OperationsServer:
     keys, instance : of the axis. verbs : the commands, by name. journal : keeps a record of them.
     note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
     samples : count of all samples when the last command was applied.
-    tell : tells the standbys of a verb that changes the model, by whom; returns how many hold it.
+    tell : has the standbys take the state of a verb that changes it; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     background : verbs that start work and do not wait for it; the others note their own events.
     replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
@@ -187,7 +187,7 @@ class OperationsServer:
         note: Callable[[str, str], None],
         role: Callable[[], str] = lambda: "primary",
         samples: Callable[[], int] = lambda: 0,
-        tell: Callable[[str, str], int] = lambda _verb, _who: 0,
+        tell: Callable[[], int] = lambda: 0,
         settle: Callable[[], bool] = lambda: False,
         background: Collection[str] = (),
         replayed: bool = True,
@@ -264,7 +264,7 @@ class OperationsServer:
             raise
         self._counts["done"] += 1
         journaled = self._write(request, seq=seq) and self._replayed
-        standbys = self._tell(request.verb, request.who) if request.verb in _TOLD else 0
+        standbys = self._tell() if request.verb in _TOLD else 0
         settled = request.verb not in self._background and self._settle()
         return to_json(
             {

@@ -1,7 +1,7 @@
 """Access of an installation on several hosts (docs/access.md).
 
-Rules of the roles; the files that `create` makes: certificates, passwords, zenoh configurations; and `check_reach`,
-which refuses endpoints beyond this machine whose configuration lacks what these have.
+Rules of the roles; the files that `create` makes: certificates and zenoh configurations; and `check_reach`, which
+refuses endpoints beyond this machine whose configuration lacks what these have.
 """
 
 from __future__ import annotations
@@ -61,8 +61,7 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
 
     Parameters
     ----------
-    users : name -> role. A name is that of the certificate and of the password both, so that neither alone is enough;
-        of services and routers, which are also connected to, the certificate alone tells.
+    users : name -> role. The name is the common name of the certificate.
     stages : name of a user with the role ``stage`` -> the one stage on the wire it may publish for; "*" or none: any.
     """
     stages = stages or {}
@@ -87,13 +86,8 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
         SERVICE: ("out", "ask", "listen", "serve", "not_of_service", "not_commanding"),
         ROUTER: ("out", "ask", "listen", "pass_on"),
     }
-    subjects, policies = [], []
+    policies = []
     for name, role in users.items():
-        subject: dict[str, Any] = {"id": name, "cert_common_names": [name]}
-        # Who opens a connection learns the certificate of who accepts it, but no user name.
-        if role not in (SERVICE, ROUTER):
-            subject["usernames"] = [name]
-        subjects.append(subject)
         ids = allowed.get(role)
         if ids is None:  # a stage: its keys are its own
             rule = f"samples_{name}"
@@ -105,7 +99,7 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for rule in rules if rule["id"] in used],
-        "subjects": subjects,
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in users],
         "policies": policies,
     }
 
@@ -126,20 +120,17 @@ def _rule(
     }
 
 
-# --- Creates the access files of an installation on several hosts: certificates, passwords, zenoh configurations.
+# --- Creates the access files of an installation on several hosts: certificates and zenoh configurations.
 #
 # ::
 #
 #     DIR/access.json        users and their roles; the other files are made from it
 #     DIR/ca/                key and certificate of the certificate authority; never copy the key to another machine
-#     DIR/users.txt          one line name:password per user, for services and routers
 #     DIR/NAME.json5         zenoh's configuration of NAME with its certificate and key; for the machine of NAME only
 #
-# A service or router needs ``users.txt`` beside its configuration. Only the owner can read the files. The ``openssl``
-# command makes the certificates.
+# Only the owner can read the files. The ``openssl`` command makes the certificates.
 
 MANIFEST: Final = "access.json"
-USERS: Final = "users.txt"
 DEFAULT_HOSTS: Final = ("localhost", "127.0.0.1")
 _SCHEMA: Final = 1
 _CA_DAYS: Final = 3650
@@ -191,7 +182,6 @@ def create(folder: Path, plan: Plan, days: int = 825) -> list[Path]:
         "-keyout", str(ca / "ca.key"), "-out", str(ca / "ca.pem"),
     )  # fmt: skip
     (ca / "ca.key").chmod(0o600)
-    _write(folder / USERS, "")
     return _write_all(folder, plan, list(plan.users), days)
 
 
@@ -206,7 +196,7 @@ def add(folder: Path, users: Mapping[str, str], stages: Mapping[str, str], days:
 
 
 def remove(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Remove ``names`` from passwords and access control; returns the changed files. Raises InputError.
+    """Remove ``names`` from access control; returns the changed files. Raises InputError.
 
     Services and routers read their files at the start: restart them with the new files to exclude the users.
     """
@@ -237,25 +227,18 @@ def read_plan(folder: Path) -> Plan:
 
 def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[Path]:
     """Write certificates for the users ``new``, and every file that depends on the list of users."""
-    passwords = dict(
-        line.split(":", 1) for line in (folder / USERS).read_text(encoding="utf-8").splitlines() if ":" in line
-    )
-    passwords = {name: passwords.get(name) or secrets.token_urlsafe(24) for name in plan.users}
-    _write(folder / USERS, "".join(f"{name}:{word}\n" for name, word in passwords.items()))
     control = access_control(plan.users, plan.stages)
-    changed = [folder / USERS]
+    changed = []
     for name, role in plan.users.items():
         path = folder / f"{name}.json5"
         listens = role in (SERVICE, ROUTER)
         if name in new:
             config = _configuration(folder / "ca", name, plan.hosts, days, listens)
-            config["transport"]["auth"] = {"usrpwd": {"user": name, "password": passwords[name]}}
         elif listens:
             config = json.loads(path.read_text(encoding="utf-8").split("\n", 1)[1])
         else:
             continue
         if listens:
-            config["transport"]["auth"]["usrpwd"]["dictionary_file"] = USERS
             config["access_control"] = control
         _write(path, f"// zenoh configuration of {name}: {ROLES[role]}; holds its key, keep it secret\n{_json(config)}")
         changed.append(path)
@@ -338,18 +321,14 @@ ADVICE: Final = (
 def check_reach(
     where: str, listen: Sequence[str], connect: Sequence[str], zenoh_config: Path | None, insecure: bool = False
 ) -> None:
-    """Refuse endpoints beyond this machine without mutual TLS, passwords and, to listen, access control.
+    """Refuse endpoints beyond this machine without mutual TLS and, to listen, access control.
 
     Raises InputError naming ``where``, the endpoint and what is missing; SessionError where the file is not zenoh's.
     ``insecure`` : True allows every endpoint.
     """
-    if insecure:
-        return
     for kind, endpoints in (("listen", listen), ("connect", connect)):
-        beyond = [endpoint for endpoint in endpoints if not is_loopback(endpoint)]
-        if not beyond:
-            continue
-        missing = missing_protection(zenoh_config, kind == "listen")
+        beyond = [endpoint for endpoint in endpoints if not insecure and not is_loopback(endpoint)]
+        missing = missing_protection(zenoh_config, kind == "listen") if beyond else []
         missing += [
             f"{endpoint} is not one of {', '.join(_SECURE_PROTOCOLS)}"
             for endpoint in beyond
@@ -359,7 +338,7 @@ def check_reach(
             raise FieldError(
                 f"{where}: {kind}",
                 f"{', '.join(beyond)} with {'; '.join(missing)}",
-                "an endpoint of this machine, or zenoh's configuration with TLS, passwords and access control",
+                "an endpoint of this machine, or zenoh's configuration with TLS and access control",
                 ADVICE,
             )
 
@@ -369,23 +348,20 @@ def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
     if zenoh_config is None:
         return ["no zenoh_config"]
     config = read_zenoh_config(zenoh_config)
-    tls, auth = _section(config, "transport/link/tls"), _section(config, "transport/auth/usrpwd")
-    protocols = _section(config, "transport/link/protocols")
-    missing = []
-    if not protocols or any(protocol not in _SECURE_PROTOCOLS for protocol in protocols):
-        missing.append("transport/link/protocols not limited to tls or quic")
-    if tls.get("verify_name_on_connect") is False and not listens:
-        missing.append("verify_name_on_connect off")
-    if listens:
-        if not tls.get("enable_mtls"):
-            missing.append("no certificates asked of clients (enable_mtls)")
-        if not auth.get("dictionary_file"):
-            missing.append("no passwords asked of clients (usrpwd/dictionary_file)")
-        if not has_access_control(zenoh_config):
-            missing.append("no access control that denies by default")
-    elif not auth.get("user"):
-        missing.append("no user and password of its own (usrpwd/user)")
-    return missing
+    tls, protocols = _section(config, "transport/link/tls"), _section(config, "transport/link/protocols")
+    return [
+        what
+        for what, is_missing in (
+            (
+                "transport/link/protocols not limited to tls or quic",
+                not protocols or not set(protocols) <= {*_SECURE_PROTOCOLS},
+            ),
+            ("verify_name_on_connect off", not listens and tls.get("verify_name_on_connect") is False),
+            ("no certificates of both ends (enable_mtls)", not tls.get("enable_mtls")),
+            ("no access control that denies by default", listens and not has_access_control(zenoh_config)),
+        )
+        if is_missing
+    ]
 
 
 def has_access_control(zenoh_config: Path | None) -> bool:

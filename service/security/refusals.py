@@ -1,6 +1,6 @@
 """Counts connections and messages that zenoh refuses, from its log.
 
-Access control drops a message without notice to either end. Each drop, wrong password and wrong certificate shows only
+Access control drops a message without notice to either end. Each drop and wrong certificate shows only
 as a line of zenoh's log, which goes to the standard output. A pipe therefore replaces the standard output of the
 process; a thread reads it, counts refusals and passes other lines to the standard error. Python's own prints go to the
 original standard output.
@@ -23,7 +23,6 @@ _LOG: Final = ",".join(
         "warn",
         "zenoh::net::routing::interceptor=trace",
         "zenoh::net::routing::interceptor::access_control=info",
-        "zenoh_transport::unicast::establishment::accept=debug",
     )
 )
 _PIPE_BYTES: Final = 1 << 20
@@ -32,7 +31,6 @@ _COLOUR: Final = re.compile(rb"\x1b\[[0-9;]*m")
 _PATTERNS: Final = (
     (re.compile(rb"interceptor: +Msg intercepted"), "messages"),
     (re.compile(rb"did not match any configured ACL subject"), "identities"),
-    (re.compile(rb"establishment::accept: +(UsrPwd|.*authenti)"), "passwords"),
     (re.compile(rb"zenoh_link_(tls|quic)\S*: .*"), "certificates"),
 )
 #: Lines of the modules asked for that are no refusals and need not be shown.
@@ -44,9 +42,8 @@ _installed: Refusals | None = None
 class Refusals:
     """Counters of refusals since :func:`count_refusals`.
 
-    ``certificates``: connections without a valid one. ``passwords``: connections with a wrong one or none.
-    ``identities``: connections with a valid certificate and a valid password that do not belong together, or to
-    nobody who is known. ``messages``: publications, queries and declarations that access control dropped.
+    ``certificates``: connections without a valid one. ``identities``: connections with a valid certificate of nobody
+    who is known. ``messages``: publications, queries and declarations that access control dropped.
     """
 
     def __init__(self) -> None:

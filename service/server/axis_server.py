@@ -15,7 +15,6 @@ from dehyst.service.background.watcher import Watcher
 from dehyst.service.failover.state_transfer import tell_standbys
 from dehyst.service.intake.sample_queue import SampleQueue
 from dehyst.service.operating.server import Journal, OperationsServer
-from dehyst.service.protocol.container import to_json
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.samples import VERSION, decode_samples
 from dehyst.service.runtime.memory import in_use
@@ -47,7 +46,7 @@ HEALTH_S: Final = 1.0
 _OPERATE_S: Final = 2.0
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
-#: Longest time for which it waits for the standbys to hold a freeze or thaw, s.
+#: Longest time for which it waits for the standbys to take the outcome, s.
 _TOLD_S: Final = 1.0
 
 
@@ -116,7 +115,7 @@ class AxisServer:
         self._answers = QueryAnswers(
             keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, authenticator, deltas
         )
-        self._operations = self._operations_server()
+        self._operations = self._operations_server(session)
         self._publications = Publications(
             session, keys, instance, self.loop, self._latency, self._answers, self.status, deltas, authenticator
         )
@@ -222,7 +221,7 @@ class AxisServer:
         config = self.axis.config
         return Journal(config.recorder or config.checkpoints)
 
-    def _operations_server(self) -> OperationsServer:
+    def _operations_server(self, session: zenoh.Session) -> OperationsServer:
         def diagnose() -> Background | None:
             return None if self.loop.watcher is None else self.loop.watcher.request
 
@@ -238,15 +237,11 @@ class AxisServer:
             self.axis.note,
             lambda: self.role,
             samples=lambda: self._operated_at,
-            tell=self._tell_standbys,
+            tell=lambda: tell_standbys(session, self.keys.switch, _TOLD_S, self.authenticator),
             settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
             background=tuple(background),
             authenticator=self.authenticator,
         )
-
-    def _tell_standbys(self, verb: str, by: str) -> int:
-        switch = to_json({"instance": self.instance, "verb": verb, "by": by, "samples": self._operated_at})
-        return tell_standbys(self._session, self.keys.switch, switch, _TOLD_S, self.authenticator)
 
     # ---- the publishing thread
 

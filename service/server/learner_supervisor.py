@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Protocol
@@ -43,6 +44,7 @@ from dehyst.service.answers.which_model import (
     SAMPLES_POISONED,
     SENSOR_FROZEN,
     VOLTAGE_DIFFERS,
+    Kept,
     ModelChoice,
     rule_of,
 )
@@ -79,8 +81,8 @@ _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range"
 FROZEN_S, MOVES_SHARE = 0.1, 0.02
 #: Time constant, s, and share of bad values from which samples are poisoned; and the share at which that ends.
 POISONED_S, POISONED_SHARE, CLEAN_SHARE = 0.25, 0.5, 0.1
-#: Time of refused motion after which that is a trouble, s.
-SILENT_S: Final = 0.5
+#: Time of refused motion after which that is a trouble, s, and readings of that time by which models are compared.
+SILENT_S, COMPARED = 0.5, 50
 
 
 @dataclass(slots=True)
@@ -109,15 +111,22 @@ class SampleWatch:
     _silent: Annotated[Run, Entry("samples since one was accepted; missing ones have a trouble of their own")]
     _bad: Annotated[float, Entry("share of bad readings of late")]
     _gate: Annotated[str, Entry("gate that refused the last sample in motion", most=1000)]
+    _recent: Annotated[
+        deque[tuple[float, float]], Entry("the last readings, and their voltages", "µm, V", "*,2", most=COMPARED)
+    ]
 
     def __init__(self, dt_s: float, span_V: float) -> None:
         self._dt_s, self._span_V = dt_s, span_V
+        self._every = max(1, round(SILENT_S / (COMPARED * dt_s)))
+        self._recent = deque(maxlen=COMPARED)
         self.count, self._y_um, self._bad, self._gate = 0, math.nan, 0.0, ""
         self._still, self._silent = Run(), Run()
 
     def take(self, u_V: float, y_um: float, verdict: str) -> None:
         """Take one sample in order, with the verdict on it."""
         self.count += 1
+        if self.count % self._every == 0 and math.isfinite(y_um) and verdict not in UNUSABLE:
+            self._recent.append((y_um, u_V))
         self._still.take(y_um == self._y_um, u_V)
         self._y_um = y_um
         if verdict != GAP:
@@ -140,6 +149,14 @@ class SampleWatch:
         moved_V = run.high_V - run.low_V
         return run.count * self._dt_s >= least_s and moved_V >= MOVES_SHARE * self._span_V
 
+    def recent(self) -> FloatArray:
+        """(4, n) y, µm, v, µm/s, a, µm/s², and u, V, of the last `SILENT_S`; unusable readings are passed over."""
+        y_um, u_V = np.array(self._recent).reshape(-1, 2).T
+        if y_um.size < 2:
+            return np.empty((4, 0))
+        v_um_per_s = np.gradient(y_um, self._every * self._dt_s)
+        return np.stack((y_um, v_um_per_s, np.gradient(v_um_per_s, self._every * self._dt_s), u_V))
+
     @property
     def why_nothing(self) -> str:
         """The reason for ``nothing_learnt`` in words."""
@@ -149,7 +166,7 @@ class SampleWatch:
 # --- Stored states of a learner.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
-STATE_SCHEMA: Final = 9
+STATE_SCHEMA: Final = 10
 #: Settings in a learner's state.
 _SETTINGS: Final = re.compile(r"(^|\.)config\.")
 
@@ -347,7 +364,7 @@ class LearnerSupervisor:
             found, why, distrusts = VOLTAGE_DIFFERS, differs, False
         elif not reported or (reported in SENSOR_FAULTS and before in (SENSOR_FROZEN, SAMPLES_POISONED)):
             found = before if reported else self.watch.trouble(before)  # a fault that is named already keeps its name
-        good = choice.choose(now, candidate, self.learner.base, found, distrusts)
+        good = choice.choose(now, candidate, self.learner.base, found, distrusts, self.watch.recent)
         if not choice.trouble and not before:
             self._mark(self.learner, received)
         if choice.trouble != before:
@@ -483,16 +500,13 @@ class LearnerSupervisor:
         """The champion under its name. Samples that teach nothing change no champion, only its model of the learner."""
         if self._failed:
             return {}
-        if self.choice.rule.teaches:
-            return champion_of(self.learner)
-        champion = last.models.get(AUTO)
-        if (
-            not isinstance(champion, ChampionInverse)
-            or self.name not in champion.names
-            or last.models[self.name] is good
-        ):
+        rule = self.choice.rule
+        found = (champion_of(self.learner) if rule.teaches else last.models).get(AUTO)
+        if not isinstance(found, ChampionInverse) or (not rule.teaches and last.models[self.name] is good):
             return {}
-        return {AUTO: champion.with_model(self.name, good)}
+        if rule.kept is Kept.NEWEST or self.name not in found.names:
+            return {AUTO: found}
+        return {AUTO: found.with_model(self.name, good)}
 
     def _mark(self, learner: OnlineModel, received: int) -> None:
         """Keep the state at fixed counts of samples; the older of two is from before any trouble that has no name yet.

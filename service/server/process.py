@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from dehyst.service.config.settings import ServeConfig
 from dehyst.service.failover.role_control import RoleControl
-from dehyst.service.failover.standby_model import PeerFiles, standby_folder
+from dehyst.service.failover.standby_model import standby_folder
 from dehyst.service.protocol.errors import FieldError, SessionError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.memory import TRIM_S, give_back, keep_little
@@ -117,13 +117,6 @@ class Service:
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.config = as_standby(config) if standby else config
-        # Where the other one of the two keeps its files.
-        self._peer_files = [
-            PeerFiles(axis.checkpoints, axis.recorder)
-            if standby
-            else PeerFiles(standby_folder(axis.checkpoints), standby_folder(axis.recorder))
-            for axis in config.axes
-        ]
         self.standby = standby
         self._stopped = stopped
         self._key: Path | None = None
@@ -160,7 +153,7 @@ class Service:
         alone_s = PATIENCE_S if config.connect else 0.0
         patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else alone_s
         try:
-            for axis, peer_files in zip(loaded, self._peer_files, strict=True):
+            for axis in loaded:
                 server = AxisServer(
                     self._session,
                     Keys(config.stage, axis.config.name),
@@ -172,7 +165,7 @@ class Service:
                 )
                 self.axes.append(server)
                 _restore(server)
-                control = RoleControl(self._session, server, patience_s, not config.listen, peer_files)
+                control = RoleControl(self._session, server, patience_s, not config.listen)
                 self._role_controls.append(control)
                 server.listen()
                 control.start()

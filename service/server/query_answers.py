@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -16,7 +14,6 @@ import zenoh
 
 from dehyst.adaptive.errors import DehystError
 from dehyst.service.answers.slices import Pace
-from dehyst.service.failover.state_transfer import part_of
 from dehyst.service.protocol.container import JSON, to_json
 from dehyst.service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from dehyst.service.protocol.keys import Keys
@@ -78,9 +75,8 @@ _COPIED_BYTES: Final = 65_536
 _POINT_BYTES: Final = 16
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02
-#: States that are copied at the same time at most, and copies that are kept until their last part is sent.
+#: States that are copied at the same time at most.
 _MOST_STATES: Final = 4
-_TRANSFER, _PART = re.compile("[0-9a-f]{1,64}"), re.compile("[0-9]{1,6}")
 
 
 class QueryAnswers:
@@ -119,8 +115,6 @@ class QueryAnswers:
         self._by = authenticator
         self.states_refused = 0
         self._copies = threading.BoundedSemaphore(_MOST_STATES)
-        #: By the name that the asking instance gave the transfer, the oldest first.
-        self._states: OrderedDict[str, bytes] = OrderedDict()
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Answer from now on; returns what is to be undeclared."""
@@ -214,48 +208,32 @@ class QueryAnswers:
         return to_json(self._status())
 
     def _on_state(self, query: zenoh.Query) -> None:
-        """Reply with a part of the state; the first one copies it, from a thread of its own: it waits for the learner,
-        and a callback must not."""
+        """Reply with the state, from a thread of its own: the copy waits for the learner, and a callback must not."""
         try:
-            check_parameters(query.parameters, "transfer", "part")
+            check_parameters(query.parameters)
             # First: strangers must not keep the places of instances, or have a thread each.
             if not self._by.is_asked_by_ours(query, self._keys.state):
                 self.states_refused += 1
                 raise ServiceError("the state is for instances of this service: sign the query, each time anew")
-            transfer, part = (query.parameters.get(name) or "" for name in ("transfer", "part"))
-            if not (_TRANSFER.fullmatch(transfer) and _PART.fullmatch(part)):
-                raise FieldError("transfer, part", f"{transfer!r}, {part!r}"[:80], "1 to 64 of 0-9 a-f, and a number")
-            if (state := self._states.get(transfer)) is not None:
-                self._send_part(query, transfer, state, int(part))
-            elif int(part):
-                raise ServiceError("the copy of this state is no longer kept: begin another transfer")
-            elif not self._copies.acquire(blocking=False):
+            if not self._copies.acquire(blocking=False):
                 raise ServiceError(f"{_MOST_STATES} states are being copied: ask again later")
-            else:
-                copy = partial(self._copy_state, query, transfer)
-                threading.Thread(target=copy, name=f"state-{self._keys.axis}", daemon=True).start()
+            threading.Thread(
+                target=self._send_state, args=(query,), name=f"state-{self._keys.axis}", daemon=True
+            ).start()
         except Exception as error:
             self._refuse(query, error)
 
-    def _copy_state(self, query: zenoh.Query, transfer: str) -> None:
+    def _send_state(self, query: zenoh.Query) -> None:
         try:
             # The asking standby gets samples from its connection on: the state must contain all that came before.
             time.sleep(_ROUTING_S)
-            state = self._states[transfer] = b"".join(encode_checkpoint(*self._checkpoints.state()))
-            while len(self._states) > _MOST_STATES:
-                self._states.popitem(last=False)
-            self._send_part(query, transfer, state, 0)
+            key, state = self._keys.state, b"".join(encode_checkpoint(*self._checkpoints.state()))
+            with query:
+                query.reply(key, state, attachment=self._by.answered(query, key, state))
         except Exception as error:
             self._refuse(query, error)
         finally:
             self._copies.release()
-
-    def _send_part(self, query: zenoh.Query, transfer: str, state: bytes, number: int) -> None:
-        key, (part, count) = self._keys.state, part_of(state, number)
-        if number == count - 1:
-            self._states.pop(transfer, None)
-        with query:
-            query.reply(key, part, attachment=self._by.answered(query, key, part))
 
     def _guarded(
         self, key: str, answer: Callable[[zenoh.Query], bytes], parameters: tuple[str, ...] = ()

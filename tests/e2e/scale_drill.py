@@ -1,6 +1,6 @@
 """A router, two service hosts and a lab host with stages and clients; one service host is lost in the middle.
 
-Hosts are groups of processes on loopback. Everything speaks TLS with passwords and access control, made by the
+Hosts are groups of processes on loopback. Everything speaks TLS with access control, made by the
 project's own command, because that is what ``dehyst serve`` asks for beyond loopback.
 """
 

@@ -213,57 +213,6 @@ static void refusals(const char *folder, const row *c) {
     free(model.bytes);
 }
 
-static size_t from_hex(const char *text, uint8_t *bytes) {
-    size_t n = 0;
-    unsigned byte;
-    while (text[0] != '-' && sscanf(text + 2 * n, "%2x", &byte) == 1)
-        bytes[n++] = (uint8_t)byte;
-    return n;
-}
-
-/* The tags of authenticators.txt; returns their number. */
-static int authenticators(const char *folder) {
-    char path[1024], line[1024], text[9][128];
-    uint8_t key[64], tag[16], wanted[16], stamps[2][16];
-    size_t key_bytes = 0;
-    int checked = 0;
-    snprintf(path, sizeof path, "%s/authenticators.txt", folder);
-    FILE *file = fopen(path, "r");
-    CHECK(file, "%s: cannot be read", path);
-    while (file && fgets(line, sizeof line, file)) {
-        if (sscanf(line, "# secret %127s", text[0]) == 1)
-            key_bytes = from_hex(text[0], key);
-        if (line[0] == '#')
-            continue;
-        int got = sscanf(line, "%127s %127s %127s %127s %127s %127s %127s %127s %127s", text[0], text[1], text[2], text[3],
-                         text[4], text[5], text[6], text[7], text[8]);
-        CHECK(got == 9, "authenticators.txt: %s", line);
-        size_t stamp = from_hex(text[3], stamps[0]), asked_stamp = from_hex(text[5], stamps[1]);
-        const char *parameters = text[4][0] == '-' ? "" : text[4];
-        payload none = {NULL, 0};
-        payload asked = text[6][0] == '-' ? none : load(folder, text[6]), said = text[7][0] == '-' ? none : load(folder, text[7]);
-        const uint8_t *kind = (const uint8_t *)text[1], *on = (const uint8_t *)text[2], *of = (const uint8_t *)parameters;
-        const uint8_t *reply[] = {kind, on, stamps[0], stamps[1], of, asked.bytes, said.bytes}, *put[] = {kind, on, stamps[0], said.bytes};
-        const uint8_t *query[] = {kind, on, stamps[0], of, said.bytes}, *claim[] = {kind, on};
-        size_t k = strlen(text[1]), o = strlen(text[2]), p = strlen(parameters);
-        size_t reply_bytes[] = {k, o, stamp, asked_stamp, p, asked.length, said.length}, put_bytes[] = {k, o, stamp, said.length};
-        size_t query_bytes[] = {k, o, stamp, p, said.length}, claim_bytes[] = {k, o};
-        int state = !strcmp(text[1], "reply")   ? dehyst_tag(key, key_bytes, reply, reply_bytes, 7, tag)
-                    : !strcmp(text[1], "put")   ? dehyst_tag(key, key_bytes, put, put_bytes, 4, tag)
-                    : !strcmp(text[1], "query") ? dehyst_tag(key, key_bytes, query, query_bytes, 5, tag)
-                                                : dehyst_tag(key, key_bytes, claim, claim_bytes, 2, tag);
-        CHECK(state == 0, "%s", dehyst_error());
-        CHECK(from_hex(text[8], wanted) == 16 && !memcmp(tag, wanted, 16), "tag of %s", text[0]);
-        free(asked.bytes);
-        free(said.bytes);
-        checked++;
-    }
-    if (file)
-        fclose(file);
-    CHECK(dehyst_tag(key, 15, NULL, NULL, 0, tag) == -1 && strstr(dehyst_error(), "16 to 64"), "a short key");
-    return checked;
-}
-
 /* What a follower that corrects gives, point after point; returns the number of points. */
 static int corrections(const char *folder, const char *table, const dehyst_limits *limits) {
     char path[1024], line[1024], model[80], change[80], read_seq[32], period_s[32];
@@ -364,7 +313,6 @@ int main(int argc, char **argv) {
     int steps = changes(argv[1], &rows[0].limits);
     CHECK(steps > 10, "%d steps of changes", steps);
     refusals(argv[1], &rows[0]);
-    CHECK(authenticators(argv[1]) >= 6, "authenticators.txt");
     CHECK(corrections(argv[1], "correction.txt", &rows[0].limits) >= 1000, "correction.txt");
     CHECK(corrections(argv[1], "repetition.txt", &rows[0].limits) >= 1000, "repetition.txt");
     printf("C: %zu queries, %d followed blocks, %d steps of changes: %d failures\n", count, followed, steps, failures);

@@ -137,11 +137,6 @@ int dehyst_memory(dehyst *handle, double *memory, size_t room);
 
 int dehyst_report(dehyst *handle, dehyst_report_t *report);
 
-/* The 16 bytes of a tag (docs/protocol.md, "Authenticator") of count parts, under the key of the service: 16 to 64
- * bytes. A part without bytes may be NULL. */
-int dehyst_tag(const uint8_t *key, size_t key_bytes, const uint8_t *const *parts, const size_t *bytes, size_t count,
-               uint8_t tag[16]);
-
 /* NULL is allowed. */
 void dehyst_close(dehyst *handle);
 

@@ -390,29 +390,6 @@ pub unsafe extern "C" fn dehyst_memory(handle: *mut Handle, memory: *mut f64, ro
 }
 
 /// # Safety
-/// `key` has `key_bytes` bytes, `parts` and `bytes` have `count` elements, part i has `bytes[i]` bytes, `tag` has 16.
-#[no_mangle]
-pub unsafe extern "C" fn dehyst_tag(
-    key: *const u8,
-    key_bytes: usize,
-    parts: *const *const u8,
-    bytes: *const usize,
-    count: usize,
-    tag: *mut u8,
-) -> c_int {
-    guarded(|| {
-        let key = read(key, key_bytes, "key")?;
-        if !(16..=64).contains(&key.len()) {
-            return Err(Error::new("key", format!("{} bytes", key.len()), "16 to 64 bytes"));
-        }
-        let given = read(parts, count, "parts")?.iter().zip(read(bytes, count, "bytes")?);
-        let parts = given.map(|(part, n)| read(*part, *n, "parts")).collect::<Result<Vec<_>>>()?;
-        write(tag, 16, "tag")?.copy_from_slice(&crate::authenticator::tag(key, &parts));
-        Ok(())
-    })
-}
-
-/// # Safety
 /// `handle` is open and not in use by another thread; `report` is valid.
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_report(handle: *mut Handle, report: *mut CReport) -> c_int {

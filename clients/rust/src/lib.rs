@@ -19,7 +19,6 @@
 //! The same through C: `include/dehyst.h`.
 
 pub mod answer;
-pub mod authenticator;
 pub mod correction;
 mod delta;
 mod error;
@@ -33,7 +32,6 @@ mod snapshot;
 pub mod wire;
 
 pub use answer::{Limits, Motion, Out};
-pub use authenticator::Authenticator;
 pub use correction::{Correcting, CorrectionSettings};
 pub use delta::{Changes, Update};
 pub use error::{Error, Result};

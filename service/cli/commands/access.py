@@ -1,4 +1,4 @@
-"""``dehyst access``: certificates, passwords and zenoh configurations for more than one machine."""
+"""``dehyst access``: certificates and zenoh configurations for more than one machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ roles:
   dehyst access add --out access --operator bob --client plotter
   dehyst access remove --out access --name bob
 
-Each NAME.json5 goes to the machine of that name and to no other; a service or a router needs users.txt beside it.
+Each NAME.json5 goes to the machine of that name and to no other.
 'serve', 'router', 'stage', 'query', 'status' and 'view' take such a file by zenoh_config or --zenoh-config. See
 docs/access.md.
 """

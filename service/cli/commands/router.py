@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--listen", action="append", metavar="ENDPOINT", help="listen here; repeatable (tcp/127.0.0.1:7447)")
     add("--connect", action="append", default=[], metavar="ENDPOINT", help="another router; repeatable")
     add_shared(parser, "insecure-beyond-loopback", "duration")
-    add_shared(parser, zenoh_config={"help": "zenoh's own configuration: TLS, passwords, access control"})
+    add_shared(parser, zenoh_config={"help": "zenoh's own configuration: TLS, access control"})
     add_shared(parser, json={"help": "print JSON"})
 
 

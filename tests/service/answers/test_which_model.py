@@ -12,7 +12,7 @@ import pytest
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.sensor_trust import SENSOR_FAULTS
 from dehyst.adaptive.state import restore, save
-from dehyst.adaptive.types import InverseModel
+from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.guard import Limits
 from dehyst.service.answers.which_model import (
     MODELS,
@@ -114,7 +114,8 @@ AGES = {
     "voltage_differs": (1, 1),
     "model_bad": (1, 1),
     "learner_failed": (1, 1),
-    **dict.fromkeys(("", "nothing_learnt"), (0, 0)),
+    "nothing_learnt": (0, 1),
+    "": (0, 0),
 }
 
 
@@ -127,7 +128,7 @@ def test_each_trouble_serves_the_model_of_its_rule(trouble: str) -> None:
     assert least <= life.number - served <= most
     newest = life.go(10, trouble, failed=trouble == "learner_failed")
     # The newest is served on, or what was kept stays.
-    assert newest == (life.number if most == 0 else served)
+    assert newest == (life.number if not trouble else served)
     assert life.choice.trouble == trouble
     # It is over half a second after the last sign of it, and the newest is served again.
     life.go(24)
@@ -135,6 +136,31 @@ def test_each_trouble_serves_the_model_of_its_rule(trouble: str) -> None:
     assert life.go(1) == life.number
     assert life.choice.trouble == ""
     assert life.choice.rule == rule_of("")
+
+
+def readings(of: InverseModel) -> FloatArray:
+    """(4, n) of a stage whose inverse is ``of``."""
+    t_s = 0.01 * np.arange(50)
+    y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 2.0 * t_s)
+    v_um_per_s = np.gradient(y_um, 0.01)
+    motion = np.stack((y_um, v_um_per_s, np.gradient(v_um_per_s, 0.01)))
+    return np.vstack((motion, of.feedforward(*motion, of.rest_memory(float(y_um[0]))).u_V))
+
+
+@pytest.mark.parametrize(("like", "served"), [(101, 101), (60, 75), (-200, 0)])
+def test_while_nothing_is_learnt_the_model_with_the_smallest_error_on_the_readings_is_served(
+    like: int, served: int
+) -> None:
+    """The newest, one from half a second to a second before, or the identified one."""
+    life = Life()
+    life.go(100)
+    recent = readings(model(like))
+    for number in range(101, 140):
+        life.choice.choose(number * EVERY, model(number), IDENTIFIED, "nothing_learnt", recent=lambda: recent)
+    good = life.choice.good
+    assert isinstance(good, LssvmInverse)
+    assert round(1e3 * float(good.beta[0] - IDENTIFIED.beta[0])) == pytest.approx(served, abs=25 if served == 75 else 0)
+    assert life.choice.trouble == "nothing_learnt"
 
 
 @pytest.mark.parametrize("trouble", ["sensor_stuck", "nothing_learnt", "learner_failed"])

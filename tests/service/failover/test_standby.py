@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,12 +18,15 @@ import pytest
 import zenoh
 
 from dehyst.service.client.client import Client
+from dehyst.service.config.settings import read_config
 from dehyst.service.failover.role_control import Claims
 from dehyst.service.operating.remote import operate
+from dehyst.service.operating.server import Journal
 from dehyst.service.protocol.keys import Keys
-from dehyst.service.runtime.session import open_client
+from dehyst.service.runtime.session import open_client, open_service
 from dehyst.service.security.authenticator import NO_KEY, own_authenticator
 from dehyst.service.security.tokens import Claim
+from dehyst.service.server.process import Service
 from dehyst.sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
@@ -319,6 +323,43 @@ def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processe
             viewer.send_signal(signal.SIGCONT)
             viewer.kill()
             viewer.communicate(timeout=20)
+
+
+def test_a_standby_that_must_serve_before_its_first_state_goes_on_from_its_own_files_and_says_so(
+    tmp_path: Path,
+) -> None:
+    """The journal in its own folder says that it was frozen when it was last ended; that holds."""
+    config, endpoints = pair_config(tmp_path)
+    keys, by = Keys("demo", "x"), own_authenticator()
+    Journal(tmp_path / "rec-standby").write({"who": "alice", "verb": "freeze", "ok": True, "samples": 0})
+    events: list[dict[str, Any]] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            life = b'{"instance": "i0-first"}'
+            query.reply(keys.status, life, attachment=by.answered(query, keys.status, life))
+
+    with open_service([endpoints[0]]) as first:
+        first.declare_queryable(keys.status, answer)
+        first.declare_subscriber(keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+        token = first.liveliness().declare_token(Claim(1, "i0-first").key(by, keys))
+        service = Service(read_config(config), standby=True)
+        starting = threading.Thread(target=service.start)
+        starting.start()
+        try:
+            eventually(lambda: service.axes and service.axes[0].status()["role"] == "standby")
+            time.sleep(1.0)
+            assert (service.axes[0].role, service.axes[0].synced) == ("standby", False)
+            token.undeclare()
+            starting.join(20.0)
+            status = service.axes[0].status()
+            assert (status["role"], status["epoch"], status["frozen"]) == ("primary", 2, True)
+            (warning,) = status["warnings"]
+            assert "without the state of the one before: it continues from the model file" in warning
+            (took,) = eventually(lambda: [event for event in events if event["event"] == "took_over"])
+            assert took["synced"] is False
+        finally:
+            service.close()
 
 
 def test_the_greatest_claim_serves() -> None:

@@ -15,19 +15,17 @@ from hypothesis import strategies as st
 from dehyst.adaptive.errors import ModelFileError
 from dehyst.service.failover.standby_model import (
     NOT_SYNCED,
-    PeerFiles,
     StandbyModel,
     newer_than,
-    restore_from_peer,
     standby_folder,
 )
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loop import AxisLoop
-from dehyst.service.storage.checkpoint import encode_checkpoint, restore_newest
+from dehyst.service.storage.checkpoint import encode_checkpoint
 from dehyst.service.storage.recorder import Recorder, RecorderConfig
 from tests.service.axes import loop_of
-from tests.service.storage.test_stored_files import folder, make_axis, meta, recording, same
+from tests.service.storage.test_stored_files import make_axis, meta, recording, same
 
 
 class Sink:
@@ -107,6 +105,36 @@ def test_a_stage_that_began_anew_while_samples_were_held_back_does_not_confuse_t
     assert same(serving, axis)
 
 
+@pytest.mark.parametrize("late", [range(380, 420, 5), range(383, 423, 5)])
+def test_a_state_that_overtakes_samples_that_it_includes_counts_them_once(late: range) -> None:
+    """Each in its message, and with one message half in the state."""
+    serving = make_axis()
+    axis, model, _, loop = standby()
+    serving.handle(recording(0, 400))
+    for first in range(300, late[0], 5):
+        loop.handle(recording(first, min(5, late[0] - first)))
+    model.take_state(state_of(serving))
+    for first in late:
+        loop.handle(recording(first, 5))
+    serving.handle(recording(400, late[-1] - 395))
+    assert axis.sequence.counters() == serving.sequence.counters()
+    assert axis.gates == serving.gates
+    assert same(serving, axis)
+
+
+def test_a_stage_that_begins_anew_right_after_the_state_is_heard() -> None:
+    serving = make_axis()
+    axis, model, _, loop = standby()
+    serving.handle(recording(10_000, 400))
+    loop.handle(recording(10_300, 50))
+    model.take_state(state_of(serving))
+    for first in range(0, 300, 5):
+        serving.handle(recording(first, 5))
+        loop.handle(recording(first, 5))
+    assert axis.sequence.restarts == serving.sequence.restarts == 1
+    assert same(serving, axis)
+
+
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=20, unique=True), st.integers(1, 4), st.integers(-1, 31))
 def test_behind_is_what_came_after(numbers: list[int], size: int, seq: int) -> None:
     cuts = [np.array(numbers[i : i + size], dtype=np.int64) for i in range(0, len(numbers), size)]
@@ -144,7 +172,7 @@ def test_without_a_state_it_learns_all_that_was_held_back() -> None:
     for first in range(0, 300, 5):
         loop.handle(recording(first, 5))
     told = model.take_over()
-    assert "its own state of sample -1, then 300 samples" in told
+    assert "the model file, then 300 samples" in told
     assert model.take_over() == ""
     alone = make_axis()
     alone.handle(recording(0, 300))
@@ -169,59 +197,6 @@ def test_what_is_no_longer_remembered_is_learnt_from_the_journal(tmp_path: Path)
     assert axis.handled_seq == 599
     assert axis.sequence.lost == 0
     assert same(axis, alone)
-
-
-def left_behind(place: Path, samples: int, kept_at: int) -> tuple[Axis, PeerFiles]:
-    """An instance that handled ``samples``, wrote its last checkpoint at ``kept_at``, and was killed."""
-    axis, files = make_axis(), PeerFiles(place / "kept", place / "rec")
-    assert files.checkpoints is not None
-    assert files.recordings is not None
-    recorder = Recorder(RecorderConfig(files.recordings, flush_s=0.005))
-    loop = loop_of(axis, recorder)
-    for first in range(0, samples, 20):
-        loop.handle(recording(first, 20))
-        if first + 20 == kept_at:
-            folder(files.checkpoints).write(meta(axis), axis.state_dict())
-    recorder.close()
-    return axis, files
-
-
-def test_who_takes_over_without_a_state_goes_on_from_what_the_other_left_behind(tmp_path: Path) -> None:
-    gone, files = left_behind(tmp_path, 800, kept_at=600)
-    axis, model, _, loop = standby()
-    axis.handle(recording(0, 100))  # its own state is old
-    for first in range(700, 900, 20):
-        loop.handle(recording(first, 20))
-    told = model.take_over(lambda newest: restore_from_peer(axis, files, "demo", newest))
-    assert told.startswith("checkpoint 1 of the other instance and its journal, sample 799, then 100")
-    gone.handle(recording(800, 100))
-    assert axis.sequence.lost == 0
-    assert same(axis, gone)
-
-
-@pytest.mark.parametrize("own", [800, 1000])
-def test_what_reaches_less_far_than_its_own_state_is_left(tmp_path: Path, own: int) -> None:
-    _, files = left_behind(tmp_path, 800, kept_at=600)
-    axis = make_axis()
-    axis.handle(recording(0, own))
-    assert restore_from_peer(axis, files, "demo", 1200) == ""
-    assert axis.handled_seq == own - 1
-    assert restore_from_peer(axis, PeerFiles(), "demo", 1200) == ""
-    assert restore_from_peer(axis, PeerFiles(tmp_path / "nowhere", None), "demo", 1200) == ""
-
-
-def test_a_damaged_checkpoint_of_the_other_is_passed_over_with_the_reason(tmp_path: Path) -> None:
-    _, files = left_behind(tmp_path, 800, kept_at=600)
-    assert files.checkpoints is not None
-    (files.checkpoints / "checkpoint-000000002.ckpt").write_bytes(b"torn")
-    axis = make_axis()
-    assert restore_from_peer(axis, files, "demo", -1).startswith("checkpoint 1 of the other instance")
-    assert axis.handled_seq == 799
-    events = axis.take_events()
-    assert [event["event"] for event in events] == ["checkpoint_refused", "restored", "learnt_again"]
-    assert "checkpoint 2 of the other instance" in events[0]["detail"]
-    # It is the other's folder: nothing of it is changed.
-    assert restore_newest(make_axis(), folder(files.checkpoints)) == 1
 
 
 def test_the_standby_keeps_its_files_beside_those_of_the_other() -> None:

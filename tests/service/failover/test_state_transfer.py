@@ -5,18 +5,16 @@ from __future__ import annotations
 import itertools
 import os
 import signal
-import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import zenoh
 
-from dehyst.service.failover.state_transfer import fetch_state, part_of
-from dehyst.service.protocol.errors import FieldError
+from dehyst.service.failover.state_transfer import fetch_state
 from dehyst.service.runtime.session import open_client, open_router
 from tests.service.conftest import unused_port
 
@@ -43,62 +41,18 @@ def endpoint() -> Iterator[str]:
         yield endpoint
 
 
-def test_the_parts_are_the_whole_and_smaller_than_a_packet() -> None:
-    for size in (0, 1, 57_344, 57_345, 200_000):
-        state = STATE[:size]
-        _, count = part_of(state, 0)
-        parts = [part_of(state, i)[0] for i in range(count)]
-        assert b"".join(part[4:] for part in parts) == state
-        assert all(len(part) < 65_000 and part[:4] == struct.pack("<I", count) for part in parts)
-        for wrong in (-1, count):
-            with pytest.raises(FieldError, match="part"):
-                part_of(state, wrong)
-
-
-class Sender:
-    """Answers for the state as an instance does; may lose replies. ``asked`` : the numbers of the parts, in order."""
-
-    def __init__(self, state: bytes = STATE, lose: Callable[[int], bool] = lambda _: False) -> None:
-        self.asked: list[int] = []
-        self._state, self._lose = state, lose
-
-    def __call__(self, query: zenoh.Query) -> None:
-        with query:
-            number = int(query.parameters.get("part", ""))
-            self.asked.append(number)
-            if not self._lose(len(self.asked)):
-                query.reply(KEY, part_of(self._state, number)[0])
+def answer(query: zenoh.Query) -> None:
+    """As an instance does."""
+    with query:
+        query.reply(KEY, STATE)
 
 
 def test_it_arrives_whole(endpoint: str) -> None:
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
         assert fetch_state(asking, KEY, 1.0) is None
-        sender = Sender()
-        serving.declare_queryable(KEY, sender)
+        serving.declare_queryable(KEY, answer)
         time.sleep(0.2)
         assert fetch_state(asking, KEY, 5.0) == STATE
-        assert sender.asked == list(range(82))
-
-
-def test_a_part_that_is_lost_is_asked_for_again(endpoint: str) -> None:
-    """One message, or parts that come by themselves, would have to begin anew."""
-    with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        sender = Sender(STATE[:500_000], lambda count: count % 4 == 2)
-        serving.declare_queryable(KEY, sender)
-        time.sleep(0.2)
-        assert fetch_state(asking, KEY, 5.0) == STATE[:500_000]
-        assert list(dict.fromkeys(sender.asked)) == list(range(9))
-        assert len(sender.asked) > 9
-
-
-@pytest.mark.parametrize("lost_from", [1, 4])
-def test_who_stops_sending_is_not_waited_for(endpoint: str, lost_from: int) -> None:
-    with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        serving.declare_queryable(KEY, Sender(STATE, lambda count: count >= lost_from))
-        time.sleep(0.2)
-        begin = time.monotonic()
-        assert fetch_state(asking, KEY, 20.0) is None
-        assert time.monotonic() - begin < 5.0
 
 
 def test_it_ends_when_the_state_is_no_longer_wanted(endpoint: str) -> None:
@@ -111,24 +65,6 @@ def test_it_ends_when_the_state_is_no_longer_wanted(endpoint: str) -> None:
         assert fetch_state(asking, KEY, 20.0, wanted=lambda: time.monotonic() < begin + 0.3) is None
         assert time.monotonic() - begin < 2.0
         held.clear()
-
-
-@pytest.mark.parametrize(
-    "said", [b"", b"abc", struct.pack("<I", 1) + bytes(60_000), struct.pack("<I", 2**32 - 1) + b"x"]
-)
-def test_what_is_no_part_fills_no_memory(endpoint: str, said: bytes) -> None:
-    with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        asked: list[int] = []
-
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                asked.append(1)
-                query.reply(KEY, said)
-
-        serving.declare_queryable(KEY, answer)
-        time.sleep(0.2)
-        assert fetch_state(asking, KEY, 5.0) is None
-        assert len(asked) == 1
 
 
 @pytest.mark.alone
@@ -154,7 +90,7 @@ def test_who_reads_slowly_makes_nobody_wait(endpoint: str) -> None:
     assert asker.stdout is not None
     try:
         with open_client(endpoint) as serving, open_client(endpoint) as stage, open_client(endpoint) as client:
-            serving.declare_queryable(KEY, Sender())
+            serving.declare_queryable(KEY, answer)
             serving.declare_queryable(ECHO, lambda query: (query.reply(ECHO, bytes(100)), query.drop()))
             heard = client.declare_subscriber(SAMPLES, lambda _: came.append(time.monotonic()))
             assert asker.stdout.readline() == "ready\n"

@@ -64,16 +64,12 @@ def as_json(path: Path) -> dict[str, Any]:
 
 def test_every_file_is_for_its_owner_alone_and_nobody_gets_the_authoritys_key(folder: Path) -> None:
     for path in folder.rglob("*"):
-        secret = path.suffix in {".key", ".json5", ".txt"}
+        secret = path.suffix in {".key", ".json5"}
         assert not secret or stat.S_IMODE(path.stat().st_mode) == 0o600, path
     assert sorted(path.stem for path in folder.glob("*.json5")) == sorted(USERS)
     key = (folder / "ca" / "ca.key").read_text().splitlines()[1]
-    passwords = [line.split(":")[1] for line in (folder / "users.txt").read_text().splitlines()]
-    assert len(set(passwords)) == len(USERS)
-    assert min(map(len, passwords)) >= 32
     for path in folder.glob("*.json5"):
         assert key not in path.read_text()
-        assert sum(password in path.read_text() for password in passwords) == 1
 
 
 def test_only_who_listens_can_be_taken_for_a_service(folder: Path) -> None:
@@ -98,7 +94,6 @@ def test_what_is_made_counts_as_closed_and_what_lacks_a_part_does_not(folder: Pa
     for section, words in (
         (("transport", "link", "protocols"), "protocols"),
         (("transport", "link", "tls", "enable_mtls"), "enable_mtls"),
-        (("transport", "auth", "usrpwd", "dictionary_file"), "passwords"),
         (("access_control",), "access control"),
     ):
         config = as_json(folder / "service.json5")
@@ -134,12 +129,13 @@ def test_who_comes_later_gets_in_and_who_leaves_is_out(folder: Path, tmp_path: P
     shutil.copytree(folder, mine)
     before = as_json(mine / "plot.json5")
     written = add(mine, {"bob": "operator", "tip": "stage"}, {"tip": "demo"})
-    assert {path.name for path in written} == {"users.txt", "bob.json5", "tip.json5", "service.json5", "router.json5"}
+    assert {path.name for path in written} == {"bob.json5", "tip.json5", "service.json5", "router.json5"}
     assert as_json(mine / "plot.json5") == before
     control = as_json(mine / "service.json5")["access_control"]
     assert {subject["id"] for subject in control["subjects"]} == {*USERS, "bob", "tip"}
     remove(mine, ["plot"])
-    assert "plot" not in (mine / "users.txt").read_text()
+    control = as_json(mine / "service.json5")["access_control"]
+    assert "plot" not in {subject["id"] for subject in control["subjects"]}
     assert not (mine / "plot.json5").exists()
     assert read_plan(mine).stages == {"other": "elsewhere", "tip": "demo"}
     with pytest.raises(InputError, match="plot"):
@@ -189,20 +185,19 @@ def test_refusals_are_counted_by_what_was_wrong() -> None:
     text = (
         b"\x1b[2m2026-01-01T00:00:00Z\x1b[0m \x1b[35mTRACE\x1b[0m rx-0 ThreadId(11) "
         b"\x1b[2mzenoh::net::routing::interceptor\x1b[0m\x1b[2m:\x1b[0m Msg intercepted!\n"
-        b"2026 DEBUG acc-0 zenoh_transport::unicast::establishment::accept: UsrPwd extension - Recv OpenSyn. Invalid\n"
         b"2026 DEBUG acc-0 zenoh_transport::unicast::establishment::accept: New transport link accepted from\n"
         b"2026 INFO acc-0 zenoh::x::access_control: abc did not match any configured ACL subject. Default\n"
         b"2026 WARN acc-0 zenoh_link_tls::unicast: invalid peer certificate. Hint: increase\n"
         b"2026 WARN somewhere: something to be shown\n"
     )
     shown = b"".join(log.feed(text[i : i + 7]) for i in range(0, len(text), 7))
-    assert log.counters() == {"messages": 1, "passwords": 1, "identities": 1, "certificates": 1}
+    assert log.counters() == {"messages": 1, "identities": 1, "certificates": 1}
     assert shown == b"2026 WARN somewhere: something to be shown\n"
 
 
 @pytest.fixture(scope="module")
 def closed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServeProcess]:
-    """A service with TLS, passwords and access control."""
+    """A service with TLS and access control."""
     at, port = tmp_path_factory.mktemp("closed"), unused_port()
     config = write_config(at, port)
     text = config.read_text().replace(f"tcp/127.0.0.1:{port}", f"tls/127.0.0.1:{port}")
@@ -288,34 +283,26 @@ def test_strangers_are_kept_out_and_counted(closed: ServeProcess, folder: Path, 
     mine, theirs = as_json(folder / "plot.json5"), tmp_path / "theirs"
     create(theirs, Plan({"service": "service", "plot": "client"}))
     forged = as_json(theirs / "plot.json5")
-    # Trusts the real service, and shows it a certificate of another authority, with the right password.
+    # Trusts the real service, and shows it a certificate of another authority.
     forged["transport"]["link"]["tls"]["root_ca_certificate_base64"] = mine["transport"]["link"]["tls"][
         "root_ca_certificate_base64"
     ]
-    forged["transport"]["auth"] = mine["transport"]["auth"]
-    wrong = json.loads(json.dumps(mine))
-    wrong["transport"]["auth"]["usrpwd"]["password"] = "guess"
-    none = json.loads(json.dumps(mine))
-    del none["transport"]["auth"]
     bare = json.loads(json.dumps(mine))
     for key in ("connect_certificate_base64", "connect_private_key_base64"):
         del bare["transport"]["link"]["tls"][key]
     bare["transport"]["link"]["tls"]["enable_mtls"] = False
-    for name, config in (("forged", forged), ("wrong", wrong), ("none", none), ("bare", bare)):
+    for name, config in (("forged", forged), ("bare", bare)):
         path = tmp_path / f"{name}.json5"
         path.write_text(json.dumps(config))
         with pytest.raises((SessionError, NoReplyError), match=r"certificate or password was refused|no reply within"):
             Client.connect(closed.endpoint, timeout_s=1.0, zenoh_config=path)
-    # The certificate of one and the password of another: both genuine, and nobody.
-    mixed = json.loads(json.dumps(mine))
-    mixed["transport"]["auth"] = as_json(folder / "alice.json5")["transport"]["auth"]
-    path = tmp_path / "mixed.json5"
-    path.write_text(json.dumps(mixed))
-    with pytest.raises(NoReplyError), open_client(closed.endpoint, zenoh_config=path) as session:
+    # A genuine certificate of somebody whom the service does not know, as after 'access remove'.
+    add(folder, {"mallory": "operator"}, {})
+    with pytest.raises(NoReplyError), open_client(closed.endpoint, zenoh_config=folder / "mallory.json5") as session:
         operate(session, KEYS, "freeze", "mallory", timeout_s=1.0)
+    remove(folder, ["mallory"])
     after = status(closed, folder)["refused"]
     assert after["certificates"] - before["certificates"] >= 2
-    assert after["passwords"] - before["passwords"] == 2
     assert after["identities"] - before["identities"] == 1
     assert after["messages"] > before["messages"]
 

@@ -14,12 +14,14 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.gates import DUPLICATE, OUT_OF_ORDER
+from dehyst.adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, OUTLIER
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from dehyst.baselines.competition.champion import ChampionInverse
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.intake.sequence import AHEAD
+from dehyst.service.protocol.keys import AUTO
 from dehyst.service.protocol.model import fingerprint
 from dehyst.service.protocol.query import STAND_IN, FeedforwardQuery
 from dehyst.service.protocol.samples import SampleBatch
@@ -201,6 +203,47 @@ def test_a_mad_model_is_never_served() -> None:
     bench.run(1000)
     assert bench.events == ["trouble", "recovered"]
     assert abs(bench.u_V - before) < 0.3
+
+
+class Refusing(SmoothingLearner):
+    """A learner that refuses every sample from number ``first`` on, after it has learnt something wrong."""
+
+    def __init__(self, inner: OnlineModel, first: int) -> None:
+        assert isinstance(inner, Learner)
+        super().__init__(inner)
+        self.first, self.at = first, -1
+
+    def handle(self, sample: Sample) -> str:
+        self.at = sample.seq
+        return OUTLIER if self.at >= self.first else super().handle(sample)
+
+    def snapshot(self) -> InverseModel:
+        model = self.inner.snapshot()
+        assert isinstance(model, LssvmInverse)
+        beta = model.beta.copy()
+        beta[-1 if beta.size == 1 else 0] *= 1.2 if self.at >= self.first - 100 else 1.0
+        return replace(model, beta=beta)
+
+
+@pytest.mark.parametrize("compete", [(), ("linear",)])
+def test_while_everything_is_refused_the_model_that_fits_the_stage_is_served(compete: tuple[str, ...]) -> None:
+    """Within half a second of motion; it did not learn the wrong thing yet."""
+    axis = make_axis(lambda m, s, lim: Refusing(make_learner(m, s, lim), 3000), compete=compete)
+    bench = Bench(axis)
+    bench.run(2890)
+    before = bench.u_V
+    bench.run(600)
+    assert abs(bench.u_V - before) > 0.3, "what was learnt last is wrong"
+    bench.run(30)
+    assert axis.newest.trouble == "nothing_learnt"
+    assert axis.answering() == "last_good"
+    assert abs(bench.u_V - before) < 0.05
+    (event,) = axis.take_events()
+    assert "no sample for 0.5 s, the last one refused as outlier" in event["detail"]
+    if compete:
+        champion = axis.newest.models[AUTO]
+        assert isinstance(champion, ChampionInverse)
+        assert dict(zip(champion.names, champion.models, strict=True))[NAME] is axis.newest.models[NAME]
 
 
 @pytest.mark.parametrize("compete", [(), ("linear",)])

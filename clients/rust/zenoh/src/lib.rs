@@ -8,14 +8,15 @@
 //! # Ok(()) }
 //! ```
 
+pub mod authenticator;
 pub mod ffi;
 mod link;
 
 pub use link::Link;
 
-use dehyst::authenticator::{Heard, Question, Sender, STAMP};
+use authenticator::{Authenticator, Heard, Sender, STAMP};
 use dehyst::json::{self, Value};
-use dehyst::{Authenticator, Error, Follower, Limits, Publisher, Result, Update};
+use dehyst::{Error, Follower, Limits, Publisher, Result, Update};
 use std::hash::{BuildHasher, RandomState};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -266,9 +267,9 @@ impl Asker {
             while let Ok(reply) = replies.recv() {
                 match reply.result() {
                     Ok(sample) => {
-                        let question = Question { key: sample.key_expr().as_str(), parameters, payload, stamp };
                         let (reply, attached) = (sample.payload().to_bytes(), bytes_of(sample.attachment()));
-                        if self.by.answers(&question, &attached, &reply) {
+                        let asked = [&stamp[..], parameters.as_bytes(), payload];
+                        if self.by.answers(sample.key_expr().as_str(), asked, &attached, &reply) {
                             return Ok((reply.into_owned(), attached));
                         }
                         unsigned += 1;

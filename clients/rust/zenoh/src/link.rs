@@ -1,7 +1,8 @@
 //! Bytes to and from the keys of an axis, without a model: what a stage, or a controller that asks ahead, needs.
 
+use crate::authenticator::Authenticator;
 use crate::{base_of, config, failed, random, Asker, Options};
-use dehyst::{wire, Authenticator, Result};
+use dehyst::{wire, Result};
 use std::sync::mpsc::{channel, Receiver};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -50,8 +51,7 @@ impl Link {
         sent.1 += 1;
         let attached = self.asker.by.publication(&key, sent.0, sent.1, &payload);
         let put = self.asker.session.put(key, payload).congestion_control(CongestionControl::Block);
-        let put = if attached.is_empty() { put } else { put.attachment(attached) };
-        put.wait().map_err(|error| failed("send", error, "an open session"))
+        put.attachment(attached).wait().map_err(|error| failed("send", error, "an open session"))
     }
 
     /// Publish samples of the stage, which the service learns from; see [`dehyst::wire::samples`].
