@@ -130,6 +130,7 @@ pub struct Integral {
     loop_: (f64, f64),
     slope: f64,
     bound_v: f64,
+    most_v: f64,
     filtered_um: f64,
     before_um: f64,
     readings: f64,
@@ -155,6 +156,7 @@ impl Integral {
             loop_: (0.0, 0.0),
             slope: 0.0,
             bound_v: 0.0,
+            most_v: 0.0,
             filtered_um: 0.0,
             before_um: f64::NAN,
             readings: 0.0,
@@ -166,13 +168,15 @@ impl Integral {
         }
     }
 
-    /// What the next readings are used by; the gain is designed anew where age or lag have changed.
+    /// What the next readings are used by; the gain is designed anew where age or lag have changed. The bound falls at
+    /// once; it rises with good readings only, by a factor e in `fade_s`.
     fn set(&mut self, age: i64, slope_v_per_um: f64, lag_s: f64, bound_v: f64) {
         if (age, lag_s) != self.designed {
             self.designed = (age, lag_s);
             self.loop_ = design(age as f64 * self.dt_s, lag_s, self.mode_hz, self.dt_s);
         }
-        (self.slope, self.bound_v) = (slope_v_per_um, bound_v);
+        (self.slope, self.most_v) = (slope_v_per_um, bound_v);
+        self.bound_v = if self.bound_v == 0.0 { bound_v } else { self.bound_v.min(bound_v) };
     }
 
     /// Use a reading: `residual_um` is wanted less read, and `speed_um_per_s` as wanted.
@@ -215,6 +219,7 @@ impl Integral {
         // A bound that has come down takes the correction along as slowly as it is let go.
         let most_v = self.bound_v.max(self.u_v.abs() * (1.0 - dt_s / self.fade_s));
         self.u_v = u_v.max(-most_v).min(most_v);
+        self.bound_v = self.most_v.min(self.bound_v * (1.0 + dt_s / self.fade_s));
     }
 
     fn begin(&mut self, u_v: f64, bound_v: f64) {
