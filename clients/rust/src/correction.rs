@@ -502,3 +502,27 @@ fn sensitivity(voltage: &mut impl FnMut(f64, f64) -> f64, y_um: f64, range_um: f
     let lag_s = (voltage(y_um, speed) - voltage(y_um, -speed)) / (2.0 * speed * slope);
     (slope, if lag_s.is_finite() { lag_s.max(0.0) } else { 0.0 })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bound_rises_with_good_readings_only() {
+        let mut integral = Integral::new(1e-3, 200.0, 0.1);
+        integral.set(1, 1.0, 0.0, 0.1);
+        integral.take(0.05, f64::INFINITY);
+        for _ in 0..20 {
+            integral.set(1, 1.0, 0.0, 5.0);
+            integral.take(3.0, f64::INFINITY);
+        }
+        assert_eq!(integral.added.doubted, 20);
+        assert!(integral.added.u_v.abs() < 0.1);
+        for _ in 0..100 {
+            integral.take(0.05, f64::INFINITY);
+        }
+        integral.take(0.2, f64::INFINITY);
+        assert_eq!(integral.added.doubted, 20);
+        assert!((integral.bound_v - 0.1 * 1.01f64.powi(101)).abs() < 1e-12);
+    }
+}
