@@ -268,6 +268,7 @@ const SLOPE_S: f64 = 0.02;
 const AGE_KEPT: u32 = 1000;
 
 /// What a follower adds to its voltages, and the readings that it waits to use.
+#[derive(Default)]
 pub struct Correcting {
     /// None: the axis has none. It stays as it is while the repetition is active.
     pub integral: Option<Integral>,
@@ -313,7 +314,6 @@ impl Correcting {
             repetition: repetition
                 .map(|given| Repetition::new(dt_s, given.mode_hz, given.fade_s, given.share * drive_v)),
             on: true,
-            age: 0,
             number: -1,
             range_um,
             most_v: integral.map_or(0.0, |settings| settings.share * drive_v),
@@ -322,10 +322,8 @@ impl Correcting {
             numbers: vec![-1; KEPT],
             readings: VecDeque::with_capacity(KEPT),
             read: -1,
-            age_held: 0,
-            slope_held: 0,
             slope_every: (SLOPE_S / dt_s).ceil().max(1.0) as u32,
-            local: (0.0, 0.0),
+            ..Correcting::default()
         })
     }
 
@@ -388,16 +386,10 @@ impl Correcting {
     /// the first one, V. `troubled`: as for `ask`.
     pub(crate) fn correct(&mut self, y_um: &[f64], u_v: &mut [f64], std_v: f64, troubled: bool) {
         if troubled || !self.on {
-            let mut added_v = 0.0;
-            if let Some(integral) = &mut self.integral {
-                integral.release();
-                added_v += integral.added.u_v;
-            }
-            if let Some(repetition) = &mut self.repetition {
-                repetition.release();
-                added_v += repetition.added.u_v;
-            }
-            u_v.iter_mut().for_each(|u| *u += added_v);
+            self.integral.iter_mut().for_each(Integral::release);
+            self.repetition.iter_mut().for_each(Repetition::release);
+            let repeated_v = self.repetition.as_ref().map_or(0.0, |repetition| repetition.added.u_v);
+            u_v.iter_mut().for_each(|u| *u += self.integral_v() + repeated_v);
             return;
         }
         if let Some((first, _)) = self.readings.front() {
