@@ -218,7 +218,7 @@ class Repetition:
         self._stated = False
         self._slope, self._lag_s, self._bound_V = 0.0, math.nan, 0.0
         self._age = -1
-        # By sample: wanted, µm; voltage, residual, low-passed residual, V; squares that `_judge` has summed. Twice what
+        # By sample: wanted, µm; voltage, residual, low-passed residual, V; squares that `_judge` sums. Twice what
         # is kept, to be one piece.
         self._columns = np.zeros((5, 2 * KEPT))
         self._y, self._w, self._r, self._low, self._square = self._columns
@@ -286,7 +286,7 @@ class Repetition:
     def read(self, number: int, residual_um: float) -> None:
         """Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
 
-        In the place of a doubted one, as in that of one that never came, nothing is learnt.
+        Nothing is learnt where the low-pass would use a doubted one; one that never came counts as 0.
         """
         i = number - self._base
         if not (number >= self._since and number < self._next and i >= 0):
@@ -295,10 +295,12 @@ class Repetition:
         doubted = not (abs(r_V) <= self._bound_V and self._slope)
         self.doubted += doubted
         self._missing = self._missing + 1 if doubted else 0
-        if not doubted:
-            self._r[i] = r_V
-        if self.active and math.isfinite(r_V):
-            self._judge(i, r_V * r_V)
+        self._r[i] = math.nan if doubted else r_V
+        if math.isfinite(r_V):
+            if self.active:
+                self._judge(i, r_V * r_V)
+            else:
+                self._square[i] = r_V * r_V
 
     def _judge(self, i: int, square: float) -> None:
         """Let go, with half the gain, once the residual of the last pass is `_GROWN` times the smallest of a pass."""
@@ -307,7 +309,6 @@ class Repetition:
         if i < n:
             return  # a late reading from before the first pass that is kept
         if math.isnan(self._power):
-            self._square[i - n : i] = self._r[i - n : i] ** 2
             self._power = self._least = float(self._square[i - n : i].sum())
         self._square[i] = min(square, _SPIKE**2 * self._power / n)
         self._power += self._square.item(i) - self._square.item(i - n)
@@ -342,6 +343,7 @@ class Repetition:
         voltage = self._of_w @ self._w[begin : begin + 2 * half + 1]
         begin = i - self._at_r - 2 * half
         low = float(self._of_r @ self._r[begin : begin + 2 * half + 1])
+        low = low if low == low else 0.0
         self._low[i] = low
         before = self._low.item(max(i - round(self._delay), 0))
         if before == before:

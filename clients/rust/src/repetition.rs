@@ -300,8 +300,8 @@ pub struct Repetition {
     slope: f64,
     lag_s: f64,
     age: i64,
-    // By sample, from sample `base` on: wanted, µm; voltage, residual, low-passed residual, V; squares that `judge` has
-    // summed. Twice what is kept, to be one piece.
+    // By sample, from sample `base` on: wanted, µm; voltage, residual, low-passed residual, V; squares that `judge`
+    // sums. Twice what is kept, to be one piece.
     y_um: Vec<f64>,
     w_v: Vec<f64>,
     r_v: Vec<f64>,
@@ -409,7 +409,7 @@ impl Repetition {
 
     /// Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
     ///
-    /// In the place of a doubted one, as in that of one that never came, nothing is learnt.
+    /// Nothing is learnt where the low-pass would use a doubted one; one that never came counts as 0.
     pub(crate) fn read(&mut self, number: i64, residual_um: f64) {
         if number < self.since.max(self.base) || number >= self.next {
             return;
@@ -420,11 +420,14 @@ impl Repetition {
             self.r_v[i] = r_v;
             self.missing = 0;
         } else {
+            self.r_v[i] = f64::NAN;
             self.added.doubted += 1;
             self.missing += 1;
         }
         if self.active && r_v.is_finite() {
             self.judge(i, r_v * r_v);
+        } else if r_v.is_finite() {
+            self.square[i] = r_v * r_v;
         }
     }
 
@@ -433,9 +436,6 @@ impl Repetition {
         let n = self.period.unwrap_or_default().round_ties_even();
         let Some(begin) = i.checked_sub(n as usize) else { return };
         let (power, least) = self.powers.unwrap_or_else(|| {
-            for (square, r_v) in self.square[begin..i].iter_mut().zip(&self.r_v[begin..i]) {
-                *square = r_v * r_v;
-            }
             let first = self.square[begin..i].iter().sum();
             (first, first)
         });
@@ -479,6 +479,9 @@ impl Repetition {
         }
         let voltage = self.of_w.apply(&self.w_v, i);
         let mut low = self.of_r.apply(&self.r_v, i);
+        if low.is_nan() {
+            low = 0.0;
+        }
         self.low_v[i] = low;
         let before = self.low_v[i.saturating_sub(self.back)];
         if !before.is_nan() {

@@ -281,6 +281,22 @@ def test_growth_is_seen_after_readings_of_the_first_pass_came_late() -> None:
     assert one.halved == 1
 
 
+def test_doubted_residuals_of_before_it_began_count_when_growth_is_judged() -> None:
+    """A ring beyond the bound is no growth of the repetition: it was there before."""
+    one = Repetition(1e-3, 200.0, 10.0)
+    one.state(0.1)
+    began = 0
+    for k in range(800):
+        one.set(1, 0.5, 2e-3, 0.2)
+        one.read(k - 1, 2.0 * math.sin(4e-2 * math.pi * (k - 1)))
+        y_um = 10.0 * math.sin(2e-2 * math.pi * k)
+        one.applied(k, 0.5 * y_um + one.add(k, y_um, 0.5 * y_um))
+        began += one.active
+    assert began > 300
+    assert one.active
+    assert one.halved == 0
+
+
 def test_a_residual_that_changes_its_sign_from_pass_to_pass_grows_little() -> None:
     """A slope of three and a half times the right one: 1 - GAIN 3.5 = -1.45."""
     loop = Loop(66.6667, slope=1.75)
