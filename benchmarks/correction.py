@@ -164,14 +164,14 @@ def run_rasters(course: ForeignCourse, ages: Sequence[int] = AGES, ways: Sequenc
     return records
 
 
-def run_stage(course: ForeignCourse, cases: Sequence[str] = tuple(CASES)) -> list[Record]:
-    """All runs of a stage; a run that raises has its traceback."""
+def run_stage(course: ForeignCourse, cases: Sequence[str] = tuple(CASES), chosen: Sequence[str] = WAYS) -> list[Record]:
+    """All runs of a stage by the ``chosen`` controllers; a run that raises has its traceback."""
     records = []
     for case in cases:
         ways, ages = CASES[case]
         there = course.at_rest() if case == "rest" else course
         for age in ages:
-            records += [run_one(there, way, age, case, figures) for way in ways]
+            records += [run_one(there, way, age, case, figures) for way in ways if way in chosen]
     return records
 
 
@@ -182,6 +182,12 @@ def _of(records: Sequence[Record], case: str, way: str, age: int, name: str) -> 
     """(stages,) figures, in the order of the seeds."""
     found = {r["seed"]: r[name] for r in records if (r["case"], r["way"], r["age"]) == (case, way, age)}
     return np.array([found[seed] for seed in sorted(found)], dtype=np.float64)
+
+
+def _over(records: Sequence[Record], case: str, way: str, age: int, name: str) -> str:
+    """The figure with the correction over that of ``way``, median and worst."""
+    ours, theirs = _of(records, case, "corrected", age, name), _of(records, case, way, age, name)
+    return _text(ours / theirs, 2) if ours.size == theirs.size else "-"
 
 
 def _text(values: FloatArray, digits: int = 3) -> str:
@@ -231,8 +237,7 @@ def tables(records: Sequence[Record]) -> str:
     rows = [
         (
             str(age), *(_text(_of(records, "gain", way, age, "before")) for way in WAYS),
-            *(_text(_of(records, "gain", "corrected", age, "before") / _of(records, "gain", way, age, "before"), 2)
-              for way in ("frozen+I", "alone")),
+            *(_over(records, "gain", way, age, "before") for way in ("frozen+I", "alone")),
         )
         for age in AGES
     ]  # fmt: skip
@@ -259,7 +264,7 @@ def tables(records: Sequence[Record]) -> str:
     parts += ["After the event, to the end of the run:", markdown(("event", "age", *names, *large), rows)]
     rows = [
         (str(age), *(_text(_of(records, "rest", way, age, "jitter"), 4) for way in names),
-         _text(_of(records, "rest", "corrected", age, "jitter") / _of(records, "rest", "alone", age, "jitter"), 2))
+         _over(records, "rest", "alone", age, "jitter"))
         for age in CASES["rest"][1]
     ]  # fmt: skip
     parts += [
@@ -282,7 +287,8 @@ def main() -> None:
     parser.add_argument(
         "--ages", nargs="+", type=int, choices=AGES, default=AGES, help="of the readings, rasters (all)"
     )
-    parser.add_argument("--ways", nargs="+", choices=RASTER_WAYS, default=RASTER_WAYS, help="of rasters (all)")
+    every = tuple(dict.fromkeys((*WAYS, *RASTER_WAYS)))
+    parser.add_argument("--ways", nargs="+", choices=every, default=every, help="controllers (all)")
     parser.add_argument("--json", type=Path, help="add the runs to this file, one a line")
     parser.add_argument("--table", type=Path, help="print the tables of the runs in this file")
     args = parser.parse_args()
@@ -294,8 +300,9 @@ def main() -> None:
         for seed in itertools.islice(seeds, args.stages):
             begin = time.process_time()
             course = course_of(seed)
-            new = run_stage(course, [case for case in args.cases if case != RASTER])
-            new += run_rasters(course, args.ages, args.ways) if RASTER in args.cases else []
+            new = run_stage(course, [case for case in args.cases if case != RASTER], args.ways)
+            of_rasters = [way for way in RASTER_WAYS if way in args.ways]
+            new += run_rasters(course, args.ages, of_rasters) if RASTER in args.cases else []
             records += new
             failed = sum("failed" in record for record in new)
             print(f"stage {seed}: {time.process_time() - begin:.0f} s, {failed} failed", file=sys.stderr, flush=True)

@@ -163,7 +163,7 @@ class Correction:
         self.loop = Loop(0.0, 0.0)
         self._dt_s, self._mode_Hz, self._fade_s = dt_s, mode_Hz, fade_s
         self._designed = (math.nan, math.nan)
-        self._slope, self._bound_V = 0.0, 0.0
+        self._slope, self._bound_V, self._most_V = 0.0, 0.0, 0.0
         self._filtered_um, self._before_um = 0.0, math.nan
         self.noise_um, self._readings = 0.0, 0
         self._speed = 0.0
@@ -174,12 +174,15 @@ class Correction:
         """What the next readings are used by; the gain is designed anew where age or lag have changed.
 
         ``age`` : samples from a reading to the voltage that it changes. ``slope_V_per_um`` , ``lag_s`` : of the model
-        (`sensitivity`). ``bound_V`` : largest correction, V, and largest residual that is no doubt.
+        (`sensitivity`). ``bound_V`` : largest correction, V, and largest residual that is no doubt. It falls at once.
+        It rises only with good readings, by a factor e in ``fade_s``: a fault of the sensor raises the deviation that
+        the model states, too.
         """
         if (age, lag_s) != self._designed:
             self._designed = (age, lag_s)
             self.loop = design(age * self._dt_s, lag_s, self._mode_Hz, self._dt_s)
-        self._slope, self._bound_V = slope_V_per_um, bound_V
+        self._slope, self._most_V = slope_V_per_um, bound_V
+        self._bound_V = min(self._bound_V, bound_V) or bound_V
 
     def take(self, residual_um: float, speed_um_per_s: float) -> None:
         """Use a reading: ``residual_um`` is wanted less read, µm, and ``speed_um_per_s`` is as wanted.
@@ -217,6 +220,7 @@ class Correction:
         # A bound that has come down takes the correction along as slowly as it is let go.
         most_V = max(self._bound_V, abs(self.u_V) * (1.0 - dt_s / self._fade_s))
         self.u_V = min(max(u_V, -most_V), most_V)
+        self._bound_V = min(self._most_V, self._bound_V * (1.0 + dt_s / self._fade_s))
 
     def begin(self, u_V: float, bound_V: float) -> None:
         """Begin with ``u_V``, V, as far as it is within ``bound_V``."""

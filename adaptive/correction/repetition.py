@@ -6,13 +6,14 @@ model's slope s = dV/dy and lag, and a low-pass Q without phase::
     w(t) = Q [w(t - P) + GAIN s r(t - P + lag)]
 
 What is added to the model's answer is w less that answer. So the learner goes on beside it and does not move the stage
-while the motion repeats, and what is above the cut-off of Q, where a stage rings, leaves the voltage. `design` chooses
+while the motion repeats, and what is above the cut-off of Q, where a stage rings, leaves the voltage. `designs` gives
 the highest cut-off at which the residual falls from pass to pass at every frequency (Longman, Iterative learning
 control and repetitive control for engineering practice, Int. J. Control 73, 2000).
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Final, NamedTuple
 
@@ -42,14 +43,17 @@ _FREQUENCIES: Final = 400
 
 
 class Design(NamedTuple):
-    """Low-pass with ``cutoff`` (half amplitude) and factor ``growth`` of the residual per pass; cut-off 0: none holds.
+    """Low-pass with ``cutoff`` (half amplitude), and the longest lag of the model with which the residual falls.
 
-    ``cutoff`` : in cycles per sample. ``half`` : half length of the low-pass, samples.
+    ``cutoff`` : in cycles per sample; 0: nothing is corrected. ``half`` : half length of the low-pass, samples.
     """
 
     cutoff: float
     half: int
-    growth: float
+    most_lag_s: float
+
+
+_NONE: Final = Design(0.0, 0, math.inf)
 
 
 def kernel(delay: float, cutoff: float, half: int) -> tuple[int, FloatArray]:
@@ -64,49 +68,61 @@ def kernel(delay: float, cutoff: float, half: int) -> tuple[int, FloatArray]:
     return first, weights / weights.sum()
 
 
-def growth(cutoff: float, half: int, lag_s: float, mode_Hz: float, dt_s: float) -> FloatArray:
-    """(n,) largest factor of the residual from pass to pass, at n frequencies up to half the sample rate.
+def most_lag_s(cutoff: float, half: int, mode_Hz: float, dt_s: float) -> float:
+    """The longest lag, s, with which a pass leaves at most `GROWTH` of the residual at every frequency; below 0: none.
 
-    The largest of ``|Q| |1 - GAIN G|`` over all stages that `design` bears: slope and lag off, and a mode of
-    `LEAST_DAMPING` or more at ``mode_Hz`` or anywhere above it. Up to ``mode_Hz`` the mode lifts the response by
-    1 / (1 - (f / mode)²) at most; from there on it may be 1 / (2 damping) at any phase.
+    The factor is ``|Q| |1 - GAIN G|``, its largest over all stages that a design bears: slope and lag off, and a mode
+    of `LEAST_DAMPING` or more at ``mode_Hz`` or anywhere above it. Up to ``mode_Hz`` the mode lifts the response by
+    1 / (1 - (f / mode)²) at most; from there on it may be 1 / (2 damping) at any phase. As the factor grows with the
+    phase, the phase that it allows gives the lag.
     """
     # Close enough about the mode, however slow it is beside the samples.
     f = np.concatenate([np.linspace(0.0, top, _FREQUENCIES) for top in (min(2.0 * mode_Hz * dt_s, 0.5), 0.5)])
-    x = np.arange(-half, half + 1)
-    low_pass = np.abs(np.cos(2.0 * np.pi * np.outer(f, x)) @ kernel(0.0, cutoff, half)[1])
-    share = f / (mode_Hz * dt_s)
-    peak = 0.5 / LEAST_DAMPING
-    lift = np.minimum(1.0 / np.maximum(1.0 - share**2, 1.0 / peak), peak)
-    phase = np.minimum(2.0 * np.pi * f * (0.5 + LAG_ERROR * lag_s / dt_s), np.pi)
-    turn = np.exp(1j * phase)
-    most = 1.0 + SLOPE_ERROR
-    least_off, most_off = np.abs(1.0 - GAIN * (1.0 - SLOPE_ERROR) * turn), np.abs(1.0 - GAIN * most * lift * turn)
-    factor = np.where(share < 1.0, np.maximum(least_off, most_off), 1.0 + GAIN * most * peak)
-    return np.asarray(low_pass * factor, dtype=np.float64)
-
-
-def design(lag_s: float, mode_Hz: float, dt_s: float) -> Design:
-    """The highest cut-off whose `growth` is at most `GROWTH` at every frequency.
-
-    Parameters
-    ----------
-    lag_s : of the model, s. mode_Hz : lowest frequency at which the stage may ring, Hz. dt_s : sample time, s.
-    """
-    cutoff = min(_OF_MODE * mode_Hz * dt_s, _OF_RATE)
-    least = _LEAST * cutoff
-    while cutoff > least:
-        half = math.ceil(_HALF / cutoff)
-        worst = float(growth(cutoff, half, lag_s, mode_Hz, dt_s).max())
-        if worst <= GROWTH:
-            return Design(cutoff, half, worst)
-        cutoff *= _STEP
-    return Design(0.0, 0, math.inf)
+    # The sum of w[k] cos(2 pi f k) by rows of n weights: k = n i + j.
+    n = math.isqrt(half) + 1
+    rows = np.zeros((n, n))
+    rows.flat[: half + 1] = kernel(0.0, cutoff, half)[1][half:]
+    rows.flat[1 : half + 1] *= 2.0
+    turn = np.exp(2j * np.pi * np.outer(f, np.arange(n)))
+    low_pass = ((turn @ rows.T) * np.exp(2j * np.pi * n * np.outer(f, np.arange(n)))).sum(axis=1).real
+    allowed = GROWTH / np.abs(low_pass)
+    share, peak = f / (mode_Hz * dt_s), 0.5 / LEAST_DAMPING
+    below, most = share < 1.0, GAIN * (1.0 + SLOPE_ERROR)
+    lift = np.minimum(1.0 / np.maximum(1.0 - share[below] ** 2, 1.0 / peak), peak)
+    gains = np.stack([np.full(lift.size, GAIN * (1.0 - SLOPE_ERROR)), most * lift])
+    # |1 - gain e^(i phase)| <= allowed
+    cos = (1.0 + gains**2 - allowed[below] ** 2) / (2.0 * gains)
+    if (cos > 1.0).any() or (allowed[~below] < 1.0 + most * peak).any():
+        return -1.0
+    bounded = (cos > -1.0) & (f[below] > 0.0)
+    phase, at = np.arccos(cos[bounded]), np.broadcast_to(f[below], cos.shape)[bounded]
+    return float(((phase / (2.0 * np.pi * at) - 0.5) * dt_s / LAG_ERROR).min(initial=math.inf))
 
 
 #: Samples that are kept: the longest period is half of them. The longest that is found is half of `SEARCHED`.
 KEPT: Final = 8192
 SEARCHED: Final = 4096
+
+
+@functools.lru_cache(maxsize=16)
+def designs(mode_Hz: float, dt_s: float) -> tuple[Design, ...]:
+    """All designs of a stage, highest cut-off first, each for longer lags than the one before.
+
+    mode_Hz : lowest frequency at which the stage may ring, Hz. dt_s : sample time, s.
+    """
+    found: list[Design] = []
+    cutoff, longest_s = min(_OF_MODE * mode_Hz * dt_s, _OF_RATE), 0.0
+    least = _LEAST * cutoff
+    # A longer low-pass does not fit into what is kept.
+    while cutoff > least and longest_s < math.inf and 2 * (half := math.ceil(_HALF / cutoff)) + 1 < KEPT:
+        lag_s = most_lag_s(cutoff, half, mode_Hz, dt_s)
+        if lag_s >= longest_s:
+            longest_s = lag_s
+            found.append(Design(cutoff, half, lag_s))
+        cutoff *= _STEP
+    return tuple(found)
+
+
 #: Shortest period, samples, and the ratio of the windows that are tried.
 _SHORTEST: Final = 16
 _WINDOWS: Final = math.sqrt(2.0)
@@ -193,16 +209,16 @@ class Repetition:
         for name, value in (("dt_s", dt_s), ("mode_Hz", mode_Hz), ("fade_s", fade_s)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"{name}: got {value}, expected a finite number above 0")
-        self._dt_s, self._mode_Hz, self._fade = dt_s, mode_Hz, math.ceil(fade_s / dt_s)
+        self._dt_s, self._fade = dt_s, math.ceil(fade_s / dt_s)
         self.u_V, self.factor = 0.0, 1.0
         self.halved = self.doubted = 0
         self.period: float | None = None
         self.active = False
-        self.design = Design(0.0, 0, math.inf)
+        self._designs, self.design = designs(mode_Hz, dt_s), _NONE
         self._stated = False
         self._slope, self._lag_s, self._bound_V = 0.0, math.nan, 0.0
         self._age = -1
-        # By sample: wanted, µm; voltage, residual, low-passed residual, V; squares that `_judge` has summed. Twice what
+        # By sample: wanted, µm; voltage, residual, low-passed residual, V; squares that `_judge` sums. Twice what
         # is kept, to be one piece.
         self._columns = np.zeros((5, 2 * KEPT))
         self._y, self._w, self._r, self._low, self._square = self._columns
@@ -241,12 +257,12 @@ class Repetition:
         self._plan()
 
     def set(self, age: int, slope_V_per_um: float, lag_s: float, bound_V: float) -> None:
-        """What the next readings are used by; as for `Correction.set`. Designs anew where lag or age have changed."""
+        """What the next readings are used by; as for `Correction.set`. Another low-pass where the lag has changed."""
         self._slope, self._bound_V = slope_V_per_um, bound_V
         # The lag of the model follows its last samples; what moves the low-pass by less than that is no other design.
         if not abs(lag_s - self._lag_s) <= 0.25 * self._dt_s + 0.1 * self._lag_s:
             self._lag_s = lag_s
-            self.design = design(lag_s, self._mode_Hz, self._dt_s)
+            self.design = next((one for one in self._designs if lag_s <= one.most_lag_s), _NONE)
             self._age = -1
         if age != self._age:
             self._age = age
@@ -270,7 +286,7 @@ class Repetition:
     def read(self, number: int, residual_um: float) -> None:
         """Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
 
-        In the place of a doubted one, as in that of one that never came, nothing is learnt.
+        Nothing is learnt where the low-pass would use a doubted one; one that never came counts as 0.
         """
         i = number - self._base
         if not (number >= self._since and number < self._next and i >= 0):
@@ -279,10 +295,12 @@ class Repetition:
         doubted = not (abs(r_V) <= self._bound_V and self._slope)
         self.doubted += doubted
         self._missing = self._missing + 1 if doubted else 0
-        if not doubted:
-            self._r[i] = r_V
-        if self.active and math.isfinite(r_V):
-            self._judge(i, r_V * r_V)
+        self._r[i] = math.nan if doubted else r_V
+        if math.isfinite(r_V):
+            if self.active:
+                self._judge(i, r_V * r_V)
+            else:
+                self._square[i] = r_V * r_V
 
     def _judge(self, i: int, square: float) -> None:
         """Let go, with half the gain, once the residual of the last pass is `_GROWN` times the smallest of a pass."""
@@ -291,7 +309,6 @@ class Repetition:
         if i < n:
             return  # a late reading from before the first pass that is kept
         if math.isnan(self._power):
-            self._square[i - n : i] = self._r[i - n : i] ** 2
             self._power = self._least = float(self._square[i - n : i].sum())
         self._square[i] = min(square, _SPIKE**2 * self._power / n)
         self._power += self._square.item(i) - self._square.item(i - n)
@@ -326,6 +343,7 @@ class Repetition:
         voltage = self._of_w @ self._w[begin : begin + 2 * half + 1]
         begin = i - self._at_r - 2 * half
         low = float(self._of_r @ self._r[begin : begin + 2 * half + 1])
+        low = low if low == low else 0.0
         self._low[i] = low
         before = self._low.item(max(i - round(self._delay), 0))
         if before == before:

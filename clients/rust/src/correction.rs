@@ -89,6 +89,7 @@ impl Oscillation {
 }
 
 /// Settings of a correction, as the status of the service has them under `correction` and under `repetition`.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CorrectionSettings {
     /// Largest correction as a share of the voltage range, above 0, up to 1.
@@ -112,15 +113,27 @@ impl CorrectionSettings {
     }
 }
 
-/// The integral of one axis, V; one `take` for each reading.
-pub struct Integral {
+/// What a correction adds, and what became of it.
+#[repr(C)]
+#[derive(Clone, Copy, Default)]
+pub struct Added {
     /// The correction, V.
     pub u_v: f64,
-    /// Share of the designed gain.
+    /// Share of its gain in use.
     pub factor: f64,
-    /// Times that an oscillation halved the gain; readings that were not used.
+    /// Times that its gain was halved; readings that were not used.
     pub halved: u64,
     pub doubted: u64,
+}
+
+impl Added {
+    pub(crate) const WHOLE: Added = Added { u_v: 0.0, factor: 1.0, halved: 0, doubted: 0 };
+}
+
+/// The integral of one axis, V; one `take` for each reading.
+#[derive(Default)]
+pub struct Integral {
+    pub added: Added,
     /// Standard deviation of a reading, µm.
     pub noise_um: f64,
     dt_s: f64,
@@ -130,6 +143,7 @@ pub struct Integral {
     loop_: (f64, f64),
     slope: f64,
     bound_v: f64,
+    most_v: f64,
     filtered_um: f64,
     before_um: f64,
     readings: f64,
@@ -142,37 +156,19 @@ pub struct Integral {
 
 impl Integral {
     fn new(dt_s: f64, mode_hz: f64, fade_s: f64) -> Integral {
-        Integral {
-            u_v: 0.0,
-            factor: 1.0,
-            halved: 0,
-            doubted: 0,
-            noise_um: 0.0,
-            dt_s,
-            mode_hz,
-            fade_s,
-            designed: (-1, f64::NAN),
-            loop_: (0.0, 0.0),
-            slope: 0.0,
-            bound_v: 0.0,
-            filtered_um: 0.0,
-            before_um: f64::NAN,
-            readings: 0.0,
-            speed: 0.0,
-            watch: Oscillation::default(),
-            quiet_s: 0.0,
-            waited_s: 0.0,
-            fade_v: 0.0,
-        }
+        let (added, designed, before_um) = (Added::WHOLE, (-1, f64::NAN), f64::NAN);
+        Integral { added, dt_s, mode_hz, fade_s, designed, before_um, ..Integral::default() }
     }
 
-    /// What the next readings are used by; the gain is designed anew where age or lag have changed.
+    /// What the next readings are used by; the gain is designed anew where age or lag have changed. The bound falls at
+    /// once; it rises with good readings only, by a factor e in `fade_s`.
     fn set(&mut self, age: i64, slope_v_per_um: f64, lag_s: f64, bound_v: f64) {
         if (age, lag_s) != self.designed {
             self.designed = (age, lag_s);
             self.loop_ = design(age as f64 * self.dt_s, lag_s, self.mode_hz, self.dt_s);
         }
-        (self.slope, self.bound_v) = (slope_v_per_um, bound_v);
+        (self.slope, self.most_v) = (slope_v_per_um, bound_v);
+        self.bound_v = if self.bound_v == 0.0 { bound_v } else { self.bound_v.min(bound_v) };
     }
 
     /// Use a reading: `residual_um` is wanted less read, and `speed_um_per_s` as wanted.
@@ -186,7 +182,7 @@ impl Integral {
         }
         let near = residual_um.abs() <= self.bound_v / slope + noise_um; // false for NaN
         if slope == 0.0 || !near {
-            self.doubted += 1;
+            self.added.doubted += 1;
             self.wait();
             return;
         }
@@ -211,20 +207,21 @@ impl Integral {
             let dead_um = DEAD_SIGMA * self.noise_um * (alpha / (2.0 - alpha)).sqrt();
             error_um -= error_um.max(-dead_um).min(dead_um);
         }
-        let u_v = self.u_v + self.factor * gain_per_s * dt_s * self.slope * error_um;
+        let u_v = self.added.u_v + self.added.factor * gain_per_s * dt_s * self.slope * error_um;
         // A bound that has come down takes the correction along as slowly as it is let go.
-        let most_v = self.bound_v.max(self.u_v.abs() * (1.0 - dt_s / self.fade_s));
-        self.u_v = u_v.max(-most_v).min(most_v);
+        let most_v = self.bound_v.max(self.added.u_v.abs() * (1.0 - dt_s / self.fade_s));
+        self.added.u_v = u_v.max(-most_v).min(most_v);
+        self.bound_v = self.most_v.min(self.bound_v * (1.0 + dt_s / self.fade_s));
     }
 
     fn begin(&mut self, u_v: f64, bound_v: f64) {
-        self.u_v = u_v.max(-bound_v).min(bound_v);
+        self.added.u_v = u_v.max(-bound_v).min(bound_v);
     }
 
     /// Give up what a new model has taken over: its voltage is by `taken_v` above that of the one before.
     fn hand_over(&mut self, taken_v: f64) {
-        let left_v = self.u_v - taken_v;
-        self.u_v = left_v.max(self.u_v.min(0.0)).min(self.u_v.max(0.0));
+        let left_v = self.added.u_v - taken_v;
+        self.added.u_v = left_v.max(self.added.u_v.min(0.0)).min(self.added.u_v.max(0.0));
     }
 
     /// Keep the correction for one sample without a reading; after `fade_s` of them in a row let it go.
@@ -239,22 +236,22 @@ impl Integral {
     /// Let the correction go for one sample; after `fade_s` of them in a row it is 0.
     fn release(&mut self) {
         if self.fade_v == 0.0 {
-            self.fade_v = self.u_v.abs() * self.dt_s / self.fade_s;
+            self.fade_v = self.added.u_v.abs() * self.dt_s / self.fade_s;
         }
-        self.u_v = (self.u_v.abs() - self.fade_v).max(0.0).copysign(self.u_v);
+        self.added.u_v = (self.added.u_v.abs() - self.fade_v).max(0.0).copysign(self.added.u_v);
         (self.filtered_um, self.before_um) = (0.0, f64::NAN);
     }
 
     /// Halve the gain once an oscillation lasts that is as fast as the loop or faster.
     fn look(&mut self, residual_um: f64, level_um: f64, turned: bool) {
-        let gain_per_s = (self.factor * self.loop_.0).max(1e-9);
+        let gain_per_s = (self.added.factor * self.loop_.0).max(1e-9);
         self.quiet_s += self.dt_s;
         if self.watch.lasts(residual_um, level_um, PI / gain_per_s, turned, self.dt_s) {
-            self.factor *= 0.5;
-            self.halved += 1;
+            self.added.factor *= 0.5;
+            self.added.halved += 1;
             self.quiet_s = 0.0;
-        } else if self.factor < 1.0 && self.quiet_s > RECOVER_S {
-            (self.factor, self.quiet_s) = ((2.0 * self.factor).min(1.0), 0.0);
+        } else if self.added.factor < 1.0 && self.quiet_s > RECOVER_S {
+            (self.added.factor, self.quiet_s) = ((2.0 * self.added.factor).min(1.0), 0.0);
         }
     }
 }
@@ -271,6 +268,7 @@ const SLOPE_S: f64 = 0.02;
 const AGE_KEPT: u32 = 1000;
 
 /// What a follower adds to its voltages, and the readings that it waits to use.
+#[derive(Default)]
 pub struct Correcting {
     /// None: the axis has none. It stays as it is while the repetition is active.
     pub integral: Option<Integral>,
@@ -316,7 +314,6 @@ impl Correcting {
             repetition: repetition
                 .map(|given| Repetition::new(dt_s, given.mode_hz, given.fade_s, given.share * drive_v)),
             on: true,
-            age: 0,
             number: -1,
             range_um,
             most_v: integral.map_or(0.0, |settings| settings.share * drive_v),
@@ -325,10 +322,8 @@ impl Correcting {
             numbers: vec![-1; KEPT],
             readings: VecDeque::with_capacity(KEPT),
             read: -1,
-            age_held: 0,
-            slope_held: 0,
             slope_every: (SLOPE_S / dt_s).ceil().max(1.0) as u32,
-            local: (0.0, 0.0),
+            ..Correcting::default()
         })
     }
 
@@ -352,7 +347,7 @@ impl Correcting {
 
     /// The integral's correction, V; 0 without one.
     pub(crate) fn integral_v(&self) -> f64 {
-        self.integral.as_ref().map_or(0.0, |integral| integral.u_v)
+        self.integral.as_ref().map_or(0.0, |integral| integral.added.u_v)
     }
 
     /// Keep what is asked for, and take the slope of `model` at the first point where that is due. `troubled`: the
@@ -391,16 +386,10 @@ impl Correcting {
     /// the first one, V. `troubled`: as for `ask`.
     pub(crate) fn correct(&mut self, y_um: &[f64], u_v: &mut [f64], std_v: f64, troubled: bool) {
         if troubled || !self.on {
-            let mut added_v = 0.0;
-            if let Some(integral) = &mut self.integral {
-                integral.release();
-                added_v += integral.u_v;
-            }
-            if let Some(repetition) = &mut self.repetition {
-                repetition.release();
-                added_v += repetition.u_v;
-            }
-            u_v.iter_mut().for_each(|u| *u += added_v);
+            self.integral.iter_mut().for_each(Integral::release);
+            self.repetition.iter_mut().for_each(Repetition::release);
+            let repeated_v = self.repetition.as_ref().map_or(0.0, |repetition| repetition.added.u_v);
+            u_v.iter_mut().for_each(|u| *u += self.integral_v() + repeated_v);
             return;
         }
         if let Some((first, _)) = self.readings.front() {
@@ -504,4 +493,28 @@ fn sensitivity(voltage: &mut impl FnMut(f64, f64) -> f64, y_um: f64, range_um: f
     }
     let lag_s = (voltage(y_um, speed) - voltage(y_um, -speed)) / (2.0 * speed * slope);
     (slope, if lag_s.is_finite() { lag_s.max(0.0) } else { 0.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bound_rises_with_good_readings_only() {
+        let mut integral = Integral::new(1e-3, 200.0, 0.1);
+        integral.set(1, 1.0, 0.0, 0.1);
+        integral.take(0.05, f64::INFINITY);
+        for _ in 0..20 {
+            integral.set(1, 1.0, 0.0, 5.0);
+            integral.take(3.0, f64::INFINITY);
+        }
+        assert_eq!(integral.added.doubted, 20);
+        assert!(integral.added.u_v.abs() < 0.1);
+        for _ in 0..100 {
+            integral.take(0.05, f64::INFINITY);
+        }
+        integral.take(0.2, f64::INFINITY);
+        assert_eq!(integral.added.doubted, 20);
+        assert!((integral.bound_v - 0.1 * 1.01f64.powi(101)).abs() < 1e-12);
+    }
 }

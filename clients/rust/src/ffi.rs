@@ -1,7 +1,7 @@
 //! The C interface of `include/dehyst.h`. Panics do not cross it.
 
 use crate::answer::{Limits, Out};
-use crate::correction::{Correcting, CorrectionSettings};
+use crate::correction::{Added, Correcting, CorrectionSettings};
 use crate::delta::Update;
 use crate::error::{Error, Result};
 use crate::follower::{Follower, Publisher};
@@ -43,26 +43,9 @@ pub struct CPoint {
 }
 
 #[repr(C)]
-pub struct CCorrection {
-    share: f64,
-    mode_hz: f64,
-    fade_s: f64,
-}
-
-/// One of the two corrections; zeros where the axis has none.
-#[repr(C)]
-#[derive(Default)]
-pub struct CAdded {
-    u_v: f64,
-    factor: f64,
-    halved: u64,
-    doubted: u64,
-}
-
-#[repr(C)]
 pub struct CCorrected {
-    integral: CAdded,
-    repetition: CAdded,
+    integral: Added,
+    repetition: Added,
     noise_um: f64,
     period: f64,
     age: i64,
@@ -235,16 +218,10 @@ pub unsafe extern "C" fn dehyst_advance(handle: *mut Handle, n: usize, y_um: *co
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_correct(
     handle: *mut Handle,
-    integral: *const CCorrection,
-    repetition: *const CCorrection,
+    integral: *const CorrectionSettings,
+    repetition: *const CorrectionSettings,
 ) -> c_int {
-    guarded(|| {
-        let settings = |given: &CCorrection| {
-            let CCorrection { share, mode_hz, fade_s } = *given;
-            CorrectionSettings { share, mode_hz, fade_s }
-        };
-        follower(handle)?.correct(integral.as_ref().map(settings), repetition.as_ref().map(settings))
-    })
+    guarded(|| follower(handle)?.correct(integral.as_ref().copied(), repetition.as_ref().copied()))
 }
 
 /// # Safety
@@ -280,21 +257,10 @@ pub unsafe extern "C" fn dehyst_corrected(handle: *mut Handle, on: c_int, correc
         let own = correcting(handle)?;
         own.on = on != 0;
         if let Some(corrected) = corrected.as_mut() {
-            let integral = own.integral.as_ref();
-            let repetition = own.repetition.as_ref();
+            let (integral, repetition) = (own.integral.as_ref(), own.repetition.as_ref());
             *corrected = CCorrected {
-                integral: integral.map_or_else(CAdded::default, |own| CAdded {
-                    u_v: own.u_v,
-                    factor: own.factor,
-                    halved: own.halved,
-                    doubted: own.doubted,
-                }),
-                repetition: repetition.map_or_else(CAdded::default, |own| CAdded {
-                    u_v: own.u_v,
-                    factor: own.factor,
-                    halved: own.halved,
-                    doubted: own.doubted,
-                }),
+                integral: integral.map_or_else(Added::default, |own| own.added),
+                repetition: repetition.map_or_else(Added::default, |own| own.added),
                 noise_um: integral.map_or(f64::NAN, |own| own.noise_um),
                 period: repetition.and_then(|own| own.period).unwrap_or(f64::NAN),
                 age: own.age,

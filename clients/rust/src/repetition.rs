@@ -3,6 +3,7 @@
 //! `adaptive/correction/repetition.py` of the service, number for number. Nothing allocates once it is made: what
 //! depends on the stage alone is computed then, and all kernels have their room.
 
+use crate::correction::Added;
 use crate::error::{Error, Result};
 use crate::model::dot;
 use std::f64::consts::PI;
@@ -281,14 +282,10 @@ fn refined(y_um: &[f64], mut period: f64, w: usize) -> Option<f64> {
 }
 
 /// What is added to the model's answers while the motion repeats; `add` and `applied` once for each point.
+#[derive(Default)]
 pub struct Repetition {
-    /// The correction of the last point, V.
-    pub u_v: f64,
-    /// Share of the gain in use.
-    pub factor: f64,
-    /// Times that growth halved the gain; readings that were not used.
-    pub halved: u64,
-    pub doubted: u64,
+    /// Of the last point.
+    pub added: Added,
     /// In samples, stated or found; None: none yet.
     pub period: Option<f64>,
     /// Whether the last point was corrected by the pass before.
@@ -303,8 +300,8 @@ pub struct Repetition {
     slope: f64,
     lag_s: f64,
     age: i64,
-    // By sample, from sample `base` on: wanted, µm; voltage, residual, low-passed residual, V; squares that `judge` has
-    // summed. Twice what is kept, to be one piece.
+    // By sample, from sample `base` on: wanted, µm; voltage, residual, low-passed residual, V; squares that `judge`
+    // sums. Twice what is kept, to be one piece.
     y_um: Vec<f64>,
     w_v: Vec<f64>,
     r_v: Vec<f64>,
@@ -334,42 +331,24 @@ impl Repetition {
     /// correction is let go. `bound_v`: largest correction, and largest residual that is no doubt.
     pub(crate) fn new(dt_s: f64, mode_hz: f64, fade_s: f64, bound_v: f64) -> Repetition {
         let kernel = || Kernel { first: 0, weights: Vec::with_capacity(KEPT) };
+        let column = || vec![0.0; 2 * KEPT];
         Repetition {
-            u_v: 0.0,
-            factor: 1.0,
-            halved: 0,
-            doubted: 0,
-            period: None,
-            active: false,
+            added: Added::WHOLE,
             dt_s,
             bound_v,
             fade: (fade_s / dt_s).ceil() as u64,
             designs: designs(mode_hz, dt_s),
-            design: None,
-            stated: false,
-            slope: 0.0,
             lag_s: f64::NAN,
             age: -1,
-            y_um: vec![0.0; 2 * KEPT],
-            w_v: vec![0.0; 2 * KEPT],
-            r_v: vec![0.0; 2 * KEPT],
-            low_v: vec![0.0; 2 * KEPT],
-            square: vec![0.0; 2 * KEPT],
-            base: 0,
-            next: 0,
-            planned: false,
-            back: 0,
+            y_um: column(),
+            w_v: column(),
+            r_v: column(),
+            low_v: column(),
+            square: column(),
             of_w: kernel(),
             of_r: kernel(),
-            since: 0,
-            same_since: 0,
             look_at: 2 * SHORTEST as i64,
-            span_um: 0.0,
-            weight: 0.0,
-            fade_v: 0.0,
-            missing: 0,
-            powers: None,
-            quiet: 0.0,
+            ..Repetition::default()
         }
     }
 
@@ -381,7 +360,7 @@ impl Repetition {
         }
         (self.since, self.same_since) = (self.next, self.next);
         self.look_at = self.next + 2 * SHORTEST as i64;
-        (self.span_um, self.weight, self.fade_v) = (0.0, 0.0, self.u_v.abs());
+        (self.span_um, self.weight, self.fade_v) = (0.0, 0.0, self.added.u_v.abs());
         (self.missing, self.powers, self.quiet) = (0, None, 0.0);
     }
 
@@ -430,7 +409,7 @@ impl Repetition {
 
     /// Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
     ///
-    /// In the place of a doubted one, as in that of one that never came, nothing is learnt.
+    /// Nothing is learnt where the low-pass would use a doubted one; one that never came counts as 0.
     pub(crate) fn read(&mut self, number: i64, residual_um: f64) {
         if number < self.since.max(self.base) || number >= self.next {
             return;
@@ -441,11 +420,14 @@ impl Repetition {
             self.r_v[i] = r_v;
             self.missing = 0;
         } else {
-            self.doubted += 1;
+            self.r_v[i] = f64::NAN;
+            self.added.doubted += 1;
             self.missing += 1;
         }
         if self.active && r_v.is_finite() {
             self.judge(i, r_v * r_v);
+        } else if r_v.is_finite() {
+            self.square[i] = r_v * r_v;
         }
     }
 
@@ -454,9 +436,6 @@ impl Repetition {
         let n = self.period.unwrap_or_default().round_ties_even();
         let Some(begin) = i.checked_sub(n as usize) else { return };
         let (power, least) = self.powers.unwrap_or_else(|| {
-            for (square, r_v) in self.square[begin..i].iter_mut().zip(&self.r_v[begin..i]) {
-                *square = r_v * r_v;
-            }
             let first = self.square[begin..i].iter().sum();
             (first, first)
         });
@@ -464,14 +443,14 @@ impl Repetition {
         let power = power + (self.square[i] - self.square[begin]);
         self.quiet += 1.0;
         if power > GROWN * GROWN * least {
-            self.factor *= 0.5;
-            self.halved += 1;
+            self.added.factor *= 0.5;
+            self.added.halved += 1;
             self.forget();
             return;
         }
         self.powers = Some((power, power.min(least)));
-        if self.factor < 1.0 && self.quiet > QUIET * n {
-            (self.factor, self.quiet) = (2.0 * self.factor, 0.0);
+        if self.added.factor < 1.0 && self.quiet > QUIET * n {
+            (self.added.factor, self.quiet) = (2.0 * self.added.factor, 0.0);
         }
     }
 
@@ -496,10 +475,13 @@ impl Repetition {
         self.follow(i);
         if !self.active {
             self.release();
-            return self.u_v;
+            return self.added.u_v;
         }
         let voltage = self.of_w.apply(&self.w_v, i);
         let mut low = self.of_r.apply(&self.r_v, i);
+        if low.is_nan() {
+            low = 0.0;
+        }
         self.low_v[i] = low;
         let before = self.low_v[i.saturating_sub(self.back)];
         if !before.is_nan() {
@@ -507,9 +489,9 @@ impl Repetition {
             low = if low * before > 0.0 { low.abs().min(before.abs()).copysign(low) } else { 0.0 };
         }
         self.weight = (self.weight + 1.0 / self.half()).min(1.0);
-        let u_v = voltage + GAIN * self.factor * low - answer_v;
-        self.u_v = self.weight * u_v.max(-self.bound_v).min(self.bound_v);
-        self.u_v
+        let u_v = voltage + GAIN * self.added.factor * low - answer_v;
+        self.added.u_v = self.weight * u_v.max(-self.bound_v).min(self.bound_v);
+        self.added.u_v
     }
 
     /// The voltage, V, that the point of sample `number` got in the end, less what others have added to it.
@@ -524,7 +506,7 @@ impl Repetition {
         if self.active {
             self.forget();
         }
-        self.u_v = (self.u_v.abs() - self.fade_v / self.half()).max(0.0).copysign(self.u_v);
+        self.added.u_v = (self.added.u_v.abs() - self.fade_v / self.half()).max(0.0).copysign(self.added.u_v);
     }
 
     /// Half length of the low-pass, samples; 1 without one.

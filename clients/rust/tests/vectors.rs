@@ -335,10 +335,17 @@ fn corrections_are_those_of_the_follower_of_the_service() {
             let got = follower.point(number(&row[1]), number(&row[2]), 0.0).unwrap();
             let correcting = follower.correcting().unwrap();
             let own = correcting.integral.as_ref().unwrap();
-            let mut state = vec![correcting.age as f64, own.u_v, own.halved as f64, own.doubted as f64];
+            let mut state =
+                vec![correcting.age as f64, own.added.u_v, own.added.halved as f64, own.added.doubted as f64];
             state.extend(correcting.repetition.as_ref().map_or([0.0, 0.0, 0.0, f64::NAN, 0.0], |own| {
                 let period = own.period.unwrap_or(f64::NAN);
-                [own.u_v, own.halved as f64, own.doubted as f64, period, f64::from(u8::from(own.active))]
+                [
+                    own.added.u_v,
+                    own.added.halved as f64,
+                    own.added.doubted as f64,
+                    period,
+                    f64::from(u8::from(own.active)),
+                ]
             }));
             let expected: Vec<f64> = row[8..].iter().map(|text| number(text)).collect();
             same(&format!("{table}: u_V of {seq}"), &[got.u_v], &[number(&row[7])]);

@@ -152,6 +152,22 @@ def test_a_bound_that_comes_down_makes_no_step() -> None:
     assert in_motion(correction, 0.0, 400) <= 0.1 * before_V
 
 
+def test_a_bound_that_readings_beyond_it_have_raised_is_not_used() -> None:
+    """A fault of the sensor raises the deviation that the model states; only good readings raise the bound."""
+    correction = Correction(1e-3, 200.0, 0.1)
+    correction.set(1, 1.0, 0.0, 0.1)
+    correction.take(0.05, math.inf)
+    for _ in range(20):
+        correction.set(1, 1.0, 0.0, 5.0)
+        correction.take(3.0, math.inf)
+    assert correction.doubted == 20
+    assert abs(correction.u_V) < 0.1
+    for _ in range(100):
+        correction.take(0.05, math.inf)
+    correction.take(0.2, math.inf)
+    assert correction.doubted == 20
+
+
 def test_what_a_model_takes_over_leaves_the_correction() -> None:
     correction = made()
     carried_V = in_motion(correction, 0.1, 200)

@@ -12,15 +12,15 @@ from scipy.signal import lfilter
 
 from dehyst.adaptive.correction.repetition import (
     GAIN,
-    GROWTH,
     KEPT,
     LAG_ERROR,
     SLOPE_ERROR,
+    Design,
     Repetition,
-    design,
+    designs,
     find_period,
-    growth,
     kernel,
+    most_lag_s,
 )
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
@@ -29,6 +29,10 @@ DT_S = st.sampled_from([1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 
 
 # ---- low-pass and design
+
+
+def design(lag_s: float, mode_Hz: float, dt_s: float) -> Design:
+    return next((one for one in designs(mode_Hz, dt_s) if lag_s <= one.most_lag_s), Design(0.0, 0, math.inf))
 
 
 @given(st.floats(10.0, 300.0), st.floats(0.01, 0.35))
@@ -50,9 +54,8 @@ def test_at_every_frequency_the_residual_of_any_stage_falls(
 ) -> None:
     """Exact responses of stages that the design is to bear, not the bound that it computes itself."""
     rng = np.random.default_rng(seed)
-    cutoff, half, worst = design(lag_s, mode_Hz, dt_s)
+    cutoff, half, _ = design(lag_s, mode_Hz, dt_s)
     assert cutoff > 0.0
-    assert worst <= GROWTH
     f = np.linspace(1e-4, 0.5, 3000)
     x = np.arange(-half, half + 1)
     low_pass = np.cos(2.0 * np.pi * np.outer(f, x)) @ kernel(0.0, cutoff, half)[1]
@@ -72,7 +75,12 @@ def test_a_higher_mode_and_a_surer_lag_give_a_higher_cutoff_and_where_none_holds
     assert cutoffs[2] == pytest.approx(4.0 * cutoffs[0], rel=0.15)
     assert design(5e-3, 400.0, 1e-3).cutoff < design(0.0, 400.0, 1e-3).cutoff
     assert design(10.0, 400.0, 1e-3).cutoff == 0.0
-    assert growth(0.2, 10, 1e-3, 60.0, 1e-3).max() > 10.0  # a cut-off above the mode
+    assert most_lag_s(0.2, 10, 60.0, 1e-3) < 0.0  # a cut-off above the mode
+
+
+def test_no_low_pass_is_longer_than_what_is_kept() -> None:
+    assert not designs(1.0, 1e-5)
+    assert all(2 * one.half + 1 < KEPT for one in designs(10.0, 1e-4))
 
 
 # ---- periods
@@ -271,6 +279,22 @@ def test_growth_is_seen_after_readings_of_the_first_pass_came_late() -> None:
     for later in range(k + 1, k + 150):
         step(later, [later - 1], 0.05 if later < k + 110 else 0.5)
     assert one.halved == 1
+
+
+def test_doubted_residuals_of_before_it_began_count_when_growth_is_judged() -> None:
+    """A ring beyond the bound is no growth of the repetition: it was there before."""
+    one = Repetition(1e-3, 200.0, 10.0)
+    one.state(0.1)
+    began = 0
+    for k in range(800):
+        one.set(1, 0.5, 2e-3, 0.2)
+        one.read(k - 1, 2.0 * math.sin(4e-2 * math.pi * (k - 1)))
+        y_um = 10.0 * math.sin(2e-2 * math.pi * k)
+        one.applied(k, 0.5 * y_um + one.add(k, y_um, 0.5 * y_um))
+        began += one.active
+    assert began > 300
+    assert one.active
+    assert one.halved == 0
 
 
 def test_a_residual_that_changes_its_sign_from_pass_to_pass_grows_little() -> None:
