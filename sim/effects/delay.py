@@ -104,9 +104,10 @@ class Late(CauseModel):
             return self
         data = fit.model.data
         own = {s.name: (s, v) for s, v in zip(fit.model.parameters[: fit.model.n_nominal], fit.p, strict=False)}
-        if not set(self.pins) <= own.keys() or any(v < s.high - 0.02 * s.step for s, v in map(own.get, self.pins)):
+        ends = [own[name] for name in self.pins if name in own]
+        if len(ends) < len(self.pins) or any(value < s.high - 0.02 * s.step for s, value in ends):
             return replace(self, most_s=0.0)
-        (lag, tau_s), (_, latch) = (own[name] for name in self.pins)
+        (lag, tau_s), (_, latch) = ends
         return replace(self, most_s=tau_s - lag.neutral + latch * data.dt_s)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
