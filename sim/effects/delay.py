@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Its step in the simulation.
 
 
-LONGEST_S = 0.005
+LONGEST_S = 0.05
 
 
 def _delay_slots(context: Context) -> int:
