@@ -139,7 +139,9 @@ def judge(
     if at is not None:
         shown = after.intervals[at]
         base = {} if was is None else before.numbers[was]
-        inside = [shown[k][0] <= v + base.get(k, 0.0) <= shown[k][1] for k, v in truth.items() if k in shown]
+        # Another cause of one set has other numbers: those of the two records cannot be compared then.
+        both = [k for k in truth if k in shown and (was is None or k in base)]
+        inside = [shown[k][0] <= truth[k] + base.get(k, 0.0) <= shown[k][1] for k in both]
         covers = all(inside) if inside else None
     if was is not None and at is not None and covers is None:
         return None

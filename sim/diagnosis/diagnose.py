@@ -22,7 +22,7 @@ from dehyst.sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
 from dehyst.sim.diagnosis.search.held_out import HeldOut, split
 from dehyst.sim.diagnosis.search.intervals import numbers, over_ties, parameter_errors
 from dehyst.sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
-from dehyst.sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
+from dehyst.sim.diagnosis.unexplained import black_box_error, black_box_on_other, follows_drive, where_left
 from dehyst.sim.diagnosis.witnesses import witnesses
 from dehyst.sim.fitting.calibration import calibrate, with_new_columns
 from dehyst.sim.fitting.fit_data import FitData
@@ -221,7 +221,8 @@ def diagnose(
         shown_floor_um = min(noise_floor(test.data).sigma_um, floor.sigma_um)
     explained = explained_share(*held_um, ceiling_um, shown_floor_um)
     shown = (on_test or (nominal, extended))[0]
-    verdict = verdict_of(causes, *held_um, is_noise(shown.residual_um, shown_mask), floor.sigma_um, explained)
+    noise = leaves_noise(shown, shown_mask, floor.sigma_um)
+    verdict = verdict_of(causes, *held_um, noise, floor.sigma_um, explained)
     partial: tuple[str, ...] = ()
     if verdict == "unexplained" and causes:
         partial, causes = tuple(c.name for c in causes if c.index >= 0), tuple(c for c in causes if c.index < 0)
@@ -278,6 +279,13 @@ def floor_beside(grid: ConverterGrid, *floors: NoiseFloor) -> NoiseFloor:
     """The lowest of the noise floors, at least the rounding error of the converter grid."""
     lowest = min(floors, key=lambda floor: floor.sigma_um)
     return replace(lowest, sigma_um=max(lowest.sigma_um, grid.step_um / np.sqrt(12.0)))
+
+
+def leaves_noise(fit: ModelFit, mask: BoolArray, floor_um: float) -> bool:
+    """Whether the residual of ``fit`` has the spectrum of noise, and no response to the drive that stands above the
+    floor: the spectrum of an error under a drive that is noise itself says nothing."""
+    follows = follows_drive(fit, mask)
+    return is_noise(fit.residual_um, mask) and (follows < IN_PART or follows * rms_um(fit, mask) ** 2 < floor_um**2)
 
 
 def rms_um(fit: ModelFit, mask: BoolArray) -> float:
@@ -352,7 +360,7 @@ def verdict_of(
     explained: float,
 ) -> str:
     """The verdict: "adequate", "effects", "partly" or "unexplained". Lengths are held-out RMS errors; ``noise``: the
-    spectrum of what the nominal stage leaves is that of noise (`is_noise`)."""
+    spectrum of what the nominal stage leaves is that of noise (`is_noise`), and it does not follow the drive."""
     structured = extended_um**2 > 1.5 * floor_um**2
     if causes:
         if any(c.index < 0 for c in causes) and not structured:

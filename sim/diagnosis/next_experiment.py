@@ -111,8 +111,8 @@ def next_experiment(
             )
         if size < 2.0 * max(here, 0.2 * sigma_um):
             return (
-                f"no drive of this stage separates {rival.name} from {rival.other} ({size * 1e3:.2g} nm rms at best, "
-                "simulated); a second sensor, a voltage monitor or a temperature log would"
+                f"{best or RATES}: {rival.name} and {rival.other} then differ most, simulated {size * 1e3:.2g} nm rms. "
+                "No drive of this stage separates them; a second sensor, a voltage monitor or a temperature log would"
             )
         return (
             f"{best}: simulated, {rival.name} and {rival.other} then differ by {size * 1e3:.3g} nm rms "

@@ -62,6 +62,41 @@ def black_box_on_other(
     return float(np.std(left))
 
 
+#: Parts of a record and taps of the finite impulse response that is fitted to each.
+_PARTS, _TAPS = 8, 32
+
+
+def follows_drive(fit: ModelFit, mask: BoolArray) -> float:
+    """Share of the squared error of ``fit`` that linear responses to the drives, one for each part of the record,
+    explain, less what they explain with the drives reversed in time: about 0 for noise, whatever its colour.
+
+    What is wrong with the timing leaves no response that holds for the whole record, but one for each part.
+    """
+    data = fit.model.data
+    n = data.n // _PARTS
+    drives = [u for u in (data.u_V, data.u2_V, data.u3_V) if u is not None]
+    shares = np.zeros(2)
+    total = 1e-300
+    for i in range(_PARTS):
+        part = slice(i * n, (i + 1) * n)
+        left = np.where(mask, fit.residual_um, 0.0)[part]
+        left = left - left.mean()
+        total += float(left @ left)
+        if not any(np.ptp(u[part]) for u in drives):
+            continue
+        for way, turn in enumerate((1, -1)):
+            rows = []
+            for u in drives:
+                x = (u[part][::turn] - u[part].mean()) / max(float(np.std(u)), 1e-300)
+                rows += [np.concatenate([np.full(k, x[0]), x[: n - k]]) for k in range(min(_TAPS, n // 8))]
+            columns = np.array(rows)
+            gram = columns @ columns.T
+            gram += 1e-6 * np.trace(gram) / len(rows) * np.eye(len(rows))
+            weights = np.linalg.solve(gram, columns @ left)
+            shares[way] += float(left @ left - np.sum(np.square(left - weights @ columns)))
+    return float(shares[0] - shares[1]) / total
+
+
 def _some(mask: BoolArray) -> IntArray:
     """Indices of at most `_MOST` samples that count."""
     return np.flatnonzero(mask)[:: max(1, int(mask.sum()) // _MOST)]

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from dehyst.adaptive.types import FloatArray
+from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
 from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
-from dehyst.sim.effects.sampled_lags import lags_of_response
+from dehyst.sim.effects.sampled_lags import has_response, lags_of_response
 from dehyst.sim.fitting.dynamics import Dynamics
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from dehyst.sim.fitting.stage_model import CauseModel, Guess, single_guesses
+from dehyst.sim.fitting.stage_model import CauseModel, Guess, ModelFit, single_guesses
 from dehyst.sim.readings.sight import Sight
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Its step in the simulation.
 
 
-LONGEST_S = 0.005
+LONGEST_S = 0.05
 
 
 def _delay_slots(context: Context) -> int:
@@ -67,12 +67,67 @@ class Delay(CauseModel):
         dt = data.dt_s
         return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 20.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
 
+    def shown(self, readings: Readings) -> CauseModel:
+        return self if has_response(readings) else Late(self.name)
+
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A voltage that runs straight to the next sample in place of being held moves it by so much.
         return {"tau_s": 0.5 * data.dt_s}
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return single_guesses([f * data.dt_s for f in (1.3, 1.8, 2.5, 3.2, 4.0, 5.0)])
+
+    def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
+        return replace(system, delay_s=float(p[0]))
+
+
+@dataclass(frozen=True)
+class Late(CauseModel):
+    """Readings that are later than the nominal stage may be, in motion too slow to show by what.
+
+    Lag, delay and the stage's own lag show only their sum there. So the stage's own lag and latch keep their neutral
+    values, and ``tau_s`` is the lateness beside them. ``most_s``: lateness of a nominal stage whose lag and latch both
+    stand at their upper bounds; 0 where they do not, and then nothing is later than it may be.
+    """
+
+    variant: str = "late"
+    fast: bool = True
+    widens: bool = True
+    pins: tuple[str, ...] = ("tau_s", "latch_samples")
+    most_s: float = 0.0
+
+    def missing(self, data: FitData) -> str:
+        return "" if self.most_s else "a lateness that the nominal stage may not have"
+
+    def found_again(self, fit: ModelFit, mask: BoolArray) -> CauseModel:
+        if any(cause.name == self.name for cause in fit.model.causes):
+            return self
+        data = fit.model.data
+        own = {s.name: (s, v) for s, v in zip(fit.model.parameters[: fit.model.n_nominal], fit.p, strict=False)}
+        ends = [own[name] for name in self.pins if name in own]
+        if len(ends) < len(self.pins) or any(value < s.high - 0.02 * s.step for s, value in ends):
+            return replace(self, most_s=0.0)
+        (lag, tau_s), (_, latch) = ends
+        return replace(self, most_s=tau_s - lag.neutral + latch * data.dt_s)
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        dt_s = data.dt_s
+        return (ModelParameter("tau_s", "s", self.most_s, 0.0, max(0.05, 20.0 * dt_s), 0.1 * dt_s, ActsOn.DYNAMICS),)
+
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        if p[0] < self.most_s + 0.15 * readings.data.dt_s:
+            return ""
+        return f"without it the stage's own lag stands at its bound, and the readings are {1e3 * p[0]:.3g} ms late"
+
+    def also(self, data: FitData) -> tuple[str, ...]:
+        return ("sensor_lag", "amplifier_lag")
+
+    def unresolved(self, data: FitData) -> dict[str, float]:
+        # A lag's readings are half a sample earlier than its time constant says.
+        return {"tau_s": 0.5 * data.dt_s}
+
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        return single_guesses([self.most_s + f * data.dt_s for f in (0.3, 1.0, 2.0, 4.0)])
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return replace(system, delay_s=float(p[0]))

@@ -7,7 +7,7 @@ reading that is taken a little later.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,6 +49,11 @@ class LagsOfResponse:
     lag_error_s: float = 0.0
 
 
+def has_response(readings: Readings) -> bool:
+    """Whether the voltage has the power above 5 Hz that a frequency response needs."""
+    return readings.response is not None and readings.response.f_hz.size >= 12
+
+
 def lags_of_response(readings: Readings) -> LagsOfResponse:
     """A delay by its phase in proportion to frequency; a further lag by its arctangent and its fall in gain.
 
@@ -57,7 +62,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     """
     data = readings.data
     response = readings.response
-    if response is None or response.f_hz.size < 12:
+    if response is None or not has_response(readings):
         return LagsOfResponse("the voltage has too little power above 5 Hz for a frequency response")
     if readings.once(speed_is_limited).seen:
         return LagsOfResponse("behind a limit of the speed the response depends on the size of the motion")
@@ -115,6 +120,14 @@ class FurtherLag(CauseModel):
     unseen_is_absent: bool = True
     fast: bool = True
     at: ActsOn = ActsOn.DYNAMICS
+    #: Without a frequency response, a lag shows only its sum with the stage's own (`delay.Late`).
+    told: bool = True
+
+    def missing(self, data: FitData) -> str:
+        return "" if self.told else "a frequency response"
+
+    def shown(self, readings: Readings) -> CauseModel:
+        return replace(self, told=has_response(readings))
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt_s = data.dt_s

@@ -99,6 +99,8 @@ class CauseModel:
     #: It takes over a part of the nominal stage: it is always fitted, from `joint_starts`, and without it the nominal
     #: stage starts from its own calibration.
     takes_over: bool = False
+    #: It widens a bound of the nominal stage at which its calibration stands, and is fitted before all others.
+    widens: bool = False
     #: It is fitted wherever another form of its effect is the most promising guess.
     beside_its_kind: bool = False
     #: Its direct test also answers to other causes: it supports the name but does not replace the null distribution.

@@ -15,7 +15,7 @@ import numpy as np
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from dehyst.sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
-from dehyst.sim.diagnosis.search.intervals import across_zero, parameter_errors
+from dehyst.sim.diagnosis.search.intervals import across_zero, numbers, parameter_errors
 from dehyst.sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from dehyst.sim.fitting.calibration import (
     calibrate,
@@ -384,7 +384,7 @@ class Search:
         thresholds, share = self.thresholds, self.share(gain_um2, held)
         ease = thresholds.seen_eases if seen else 1.0
         # With a coarse grid, rounding errors repeat wherever the stage rests and could look like a cause.
-        if gain_um2 < (0.5 if self.coarse else thresholds.least_of_floor / ease) * self.noise_um2:
+        if gain_um2 < (0.5 if self.coarse and not seen else thresholds.least_of_floor / ease) * self.noise_um2:
             return False
         large = seen or share > thresholds.nearly_all or gain_um2 > thresholds.least_share * self.nominal_um2
         return large and share > thresholds.least_share / ease
@@ -393,7 +393,27 @@ class Search:
         """Add causes to the calibrated nominal stage, one per round, until none is acceptable."""
         held = self.held(nominal)
         self.nominal, self.nominal_um2 = nominal, held.sse_um2
-        return self.extended(nominal, held)
+        self.first_looks, _ = self._looks_beside(nominal)
+        steps: list[AcceptedCause] = []
+        current = nominal
+        for wider in [c for c in self.causes if c.widens and not c.missing(nominal.model.data)]:
+            found = self._widened(wider, nominal)
+            gain = held.sse_um2 - found.held.sse_um2
+            if gain <= 0.0 or not self.agreement(found):
+                continue
+            self._with_agreement(found)
+            steps.append(AcceptedCause(wider.name, p_value(self.first_looks, gain, self.seed), gain / held.sse_um2))
+            current, held = found.fit, found.held
+        current, held, more = self.extended(current, held)
+        return current, held, [*steps, *more]
+
+    def _widened(self, cause: CauseModel, nominal: ModelFit) -> CauseCandidate:
+        """The nominal stage with a bound widened at which its calibration stands."""
+        model = nominal.model.with_cause(cause)
+        own = [s.neutral for s in cause.parameters(model.data)]
+        fit = with_new_columns(calibrate(model, np.append(nominal.p, own), self.mask, 20, 1e-5), self.mask)
+        held = self.held(fit)
+        return CauseCandidate(cause, fit, held, self.cost(fit, held, nominal))
 
     def extended(self, current: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Add causes to a fit, but none that the review dropped."""
@@ -405,7 +425,6 @@ class Search:
             for name in names & self.left_um2.keys():
                 left_um2 += self.left_um2[name]
             looks, _ = self._looks_beside(current)
-            self.first_looks = self.first_looks or looks
             ranked = self.refit(current, looks, self.thresholds.refits, 0.0)
             accepted: CauseCandidate | None = None
             p = 1.0
@@ -638,6 +657,12 @@ class Search:
             return False
         return across_zero(parameter_errors(fit, self.mask, self.parts, self.readings), index)
 
+    def beyond_bound(self, fit: ModelFit, index: int) -> bool:
+        """Whether the interval of the first number of ``causes[index]`` lies beyond the bound that it widens."""
+        cause = fit.model.causes[index]
+        (low, _), *_ = numbers(parameter_errors(fit, self.mask, self.parts, self.readings), index)[1].values()
+        return low > cause.parameters(fit.model.data)[0].neutral
+
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""
         fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, 12, 1e-5), self.mask)
@@ -694,13 +719,18 @@ def review(
         less = search.without(fit, index)
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
+        if cause.widens and search.beyond_bound(fit, index):
+            # A bound was widened for it, and nothing competes with it: its own number decides.
+            found.append(ReviewedCause(steps[cause.name], less.without_signals(), held_less))
+            index += 1
+            continue
         is_line = cause.line_hz(fit.model.parameters_of(fit.p, index)) is not None
         small = not is_line and gain <= thresholds.least_about_zero * held_less.sse_um2
-        if gain <= 0.0 or not (is_line or search.worth(gain, held_less, search.seen(cause))):
+        if not cause.widens and (gain <= 0.0 or not (is_line or search.worth(gain, held_less, search.seen(cause)))):
             fit, held = less, held_less
             found, index = [], 0
             continue
-        if search.may_be_zero(fit, index, small):
+        if cause.widens or search.may_be_zero(fit, index, small):
             search.uncertain.add(cause.name)
             # It may have stood in the place of another cause.
             fit, held, more = search.extended(*search.filled(less))
