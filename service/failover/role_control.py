@@ -157,12 +157,10 @@ class RoleControl:
 
     def _on_switch(self, query: zenoh.Query) -> None:
         """An operator has changed the state that is served: answer once this instance has taken it anew. A verb must
-        hold even if the instance that serves dies right after."""
+        hold even if the instance that serves dies right after. A query without an answer is not counted there."""
         if self.server.role == STANDBY and self.server.authenticator.is_asked_by_ours(query, self.server.keys.switch):
             self._waiting.append(query)
             self._refetch_state()
-        else:
-            query.drop()  # the sender counts those who confirm
 
     def _refetch_state(self) -> None:
         self._outdated = True

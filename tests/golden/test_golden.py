@@ -189,7 +189,7 @@ def standing(axis: Axis) -> dict[str, Any]:
 
 
 def learner_counters(axis: Axis) -> dict[str, int]:
-    """What the learner counted: verdicts and events. Without the counts that depend on the rounding of the processor."""
+    """What the learner counted: verdicts and events, without the counts that depend on the processor's rounding."""
     learner: Any = axis.learner
     return {name: count for name, count in learner.counters().items() if name not in ROUNDING}
 
