@@ -803,7 +803,7 @@ def ablate(
     repeated = [numbers for name, numbers in done.items() if name in noises]
     results = Results(base, repeated, groups, {name: n for name, n in done.items() if name in known}, planned)
     # What is kept in the caches of functions was computed with all rules.
-    for made in [made for made in gc.get_objects() if isinstance(made, functools._lru_cache_wrapper)]:
+    for made in [made for made in gc.get_objects() if type(made) is functools._lru_cache_wrapper]:
         made.cache_clear()
     begun = time.monotonic()
     for k, (variant, noise, numbers) in enumerate(

@@ -181,7 +181,7 @@ FORMS: Final[tuple[Form, ...]] = ("inverse", "cholesky", "auto")
 @compiled
 def _slide(A: WindowArrays, X: FloatArray, y: FloatArray, slots: NDArray[np.int64], start: int) -> int:
     for k in range(start, y.shape[0]):
-        if window_core.replace(A, slots[k], X[k], y[k], 1.0) != 0:
+        if window_core.replace(A, slots[k], X[k], y[k]) != 0:
             return k
     return y.shape[0]
 
