@@ -306,9 +306,11 @@ def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
             rows, numbers = read_journal(path)
         except OSError:
             continue
+        if not len(rows):  # killed right after it was opened
+            continue
         # Position relative to ``index``; the stored count wraps around.
         place = (numbers - index + INDEX_MODULUS // 2) % INDEX_MODULUS - INDEX_MODULUS // 2
-        starts = [0, *(np.nonzero(np.diff(place) != 1)[0] + 1).tolist()] if len(rows) else []
+        starts = [0, *(np.nonzero(np.diff(place) != 1)[0] + 1).tolist()]
         for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
             have, at = len(columns[0]), int(place[start])
             skip = max(0, -at)

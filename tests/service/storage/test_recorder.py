@@ -250,6 +250,9 @@ def test_a_restart_finds_what_came_behind_its_checkpoint_across_segments(tmp_pat
     assert behind.seq.tolist() == list(range(1100, 1200))
     assert recorder_files.rows_behind(tmp_path, 7 + 1200, "") is None
     assert recorder_files.rows_behind(tmp_path, 3, "") is None
+    # One that was killed right after it had opened a segment.
+    recorder_files.journal_of(tmp_path, 900).write_bytes(recorder_files.HEADER)
+    assert recorder_files.rows_behind(tmp_path, 7 + 1200, "") is None
     # An instance that took over an older state handles some samples again, and what follows is of its count.
     with Recorder(config(tmp_path), index=1150) as recorder:
         recorder.put(*block(5000, 50), reason="learnt")
