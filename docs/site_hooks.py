@@ -51,11 +51,13 @@ def rewritten(markdown: str, page: str) -> str:
     return _LINK.sub(link, markdown)
 
 
-def on_config(config: Any) -> Any:
-    """Lay the packages out as they are installed: the reader of docstrings does not import them."""
+def on_startup(**_: Any) -> None:
+    """Lay the packages out as they are installed: the reader of docstrings does not import them.
+
+    Before it looks for them: of a folder that comes later it sees nothing.
+    """
     command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", "build/typed"]
     subprocess.run(command, cwd=ROOT, check=True, stderr=subprocess.DEVNULL)
-    return config
 
 
 def on_files(files: Any, config: Any) -> Any:
