@@ -495,8 +495,12 @@ def _work_in_copy(select: Sequence[str], variant: Variant, most_s: float, toward
         command = [sys.executable, "-m", "benchmarks.ablation", "--bare", "--json", str(results), *select]
         limit = (int(most_s + COMPILE_S), int(most_s + COMPILE_S) + 5)
         resource.setrlimit(resource.RLIMIT_CPU, limit)
-        subprocess.run(command, cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, stderr=subprocess.DEVNULL)
-        for entry in read_lines([results]) if results.exists() else []:
+        env = os.environ | {"PYTHONPATH": str(root)}
+        done = subprocess.run(command, cwd=root, env=env, stderr=subprocess.PIPE, text=True)
+        if done.returncode:
+            _say(f"{variant.name}: {done.stderr[-500:]}")
+            sys.exit(done.returncode)
+        for entry in read_lines([results]):
             for pair in entry["cases"].items():
                 towards.send(pair)
 
