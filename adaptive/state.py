@@ -13,6 +13,8 @@ stranger. `restore` does the same for an object that is no dataclass, in place. 
 
 A class whose ``KIND`` is a text says so in an entry of that name, so that none is taken for another.
 
+`Numbers` keep their numbers in a structured array, which compiled code reads and writes too.
+
 What a field may be: a number, a truth value, a text; an array; a list or tuple of numbers, stored as an array; a list,
 tuple or deque of arrays or of rows of numbers; a dictionary of numbers or arrays by name; another record, or None; a
 list or tuple of records.
@@ -87,6 +89,90 @@ class Kinded:
     """A class whose states say of which kind they are."""
 
     KIND: ClassVar[str]
+
+
+class Numbers:
+    """A record whose numbers are in ``record``, a structured array of shape () that compiled code works on too.
+
+    Declared and made as a dataclass is: ``Rest(constant_V=0.0)`` has an array of its own, ``Rest(record=...)`` is a
+    view of another's. What may be None has a truth value there. A class with an ``__init__`` of its own is a part.
+    """
+
+    record: Any
+    _defaults: ClassVar[dict[str, Any]]
+
+    def __init_subclass__(cls) -> None:
+        cls._defaults = {}
+        own: Any = cls
+        for slot in _slots(own):
+            name = slot.field.lstrip("_")
+            if slot.optional:
+                setattr(cls, slot.field, _at_times(name))
+            elif slot.kind == "number":
+                if slot.field in vars(cls):
+                    cls._defaults[slot.field] = vars(cls)[slot.field]
+                setattr(cls, slot.field, _number_in_record(name))
+            elif slot.kind == "record" and issubclass(slot.of, Numbers):
+                setattr(cls, slot.field, _record_in_record(name, slot.of))
+
+    def __init__(self, *values: Any, record: Any = None, **named: Any) -> None:
+        self.record = record
+        if record is None:
+            self.record = np.zeros((), record_of(_type(self)))
+            fields = [slot.field for slot in _slots(_type(self))]
+            given = self._defaults | dict(zip(fields, values, strict=False)) | named
+            if given.keys() != set(fields):
+                raise TypeError(f"{type(self).__name__}: got {', '.join(given)}, expected {', '.join(fields)}")
+            for field, value in given.items():
+                setattr(self, field, value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Numbers) and bool(self.record == other.record)
+
+
+def _number_in_record(name: str) -> property:
+    def read(self: Numbers) -> Any:
+        return self.record[name].item()
+
+    def write(self: Numbers, value: Any) -> None:
+        self.record[name] = value
+
+    return property(read, write)
+
+
+def _record_in_record(name: str, of: Any) -> property:
+    def read(self: Numbers) -> Any:
+        kept = vars(self).get(name)
+        if kept is None:
+            kept = vars(self)[name] = of(record=self.record[name])
+        return kept
+
+    def write(self: Numbers, value: Numbers) -> None:
+        self.record[name] = value.record
+
+    return property(read, write)
+
+
+def _at_times(name: str) -> property:
+    def read(self: Numbers) -> Any:
+        return vars(self)[name] if self.record[name] else None
+
+    def write(self: Numbers, value: Any) -> None:
+        vars(self)[name], self.record[name] = value, value is not None
+
+    return property(read, write)
+
+
+@cache
+def record_of(cls: Any) -> Any:
+    """The structured type that holds the numbers of a class and of its parts by their names; None without any."""
+    fields: list[tuple[str, Any]] = []
+    for slot in _slots(cls):
+        if issubclass(cls, Numbers) and (slot.optional or slot.kind == "number"):
+            fields.append((slot.field.lstrip("_"), bool if slot.optional else slot.of))
+        elif slot.kind in ("record", "part") and not slot.optional and record_of(slot.of) is not None:
+            fields.append((slot.field.lstrip("_"), record_of(slot.of)))
+    return np.dtype(fields, align=True) if fields else None
 
 
 @runtime_checkable
@@ -186,7 +272,9 @@ def _slot(field: str, hint: Any, entry: Entry) -> _Slot:
         if get_origin(of[0]) is np.ndarray:
             kind, made = "arrays", np.dtype(get_args(get_args(of[0])[1])[0])
     else:
-        kind, made = ("record" if is_dataclass(hint) or issubclass(hint, tuple) else "part"), hint
+        whole = is_dataclass(hint) or issubclass(hint, tuple)
+        whole = whole or (issubclass(hint, Numbers) and hint.__init__ is Numbers.__init__)
+        kind, made = "record" if whole else "part", hint
     name = field.lstrip("_") if entry.name is None else entry.name
     least = len(of) if make is tuple and Ellipsis not in of else 0
     return _Slot(field, name, entry, kind, made, optional, make, shapes, least)
@@ -267,6 +355,8 @@ def _put(part: Any, values: dict[str, Any]) -> None:
         value = values[slot.field]
         if slot.kind == "part":
             _put(getattr(part, slot.field), value)
+        elif isinstance(part, Numbers) and slot.kind == "array":
+            getattr(part, slot.field)[...] = value
         else:
             setattr(part, slot.field, deque(value, getattr(part, slot.field).maxlen) if slot.make is deque else value)
 

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan, nan
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled, shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers, record_of
 from dehyst.adaptive.types import FloatArray
 
 # --- The drift filter's algebra, compiled: one scalar measurement of a random walk, in O(p²).
@@ -182,8 +182,7 @@ class DriftConfig:
             raise InputError(f"drift.noise: got {self.noise}, expected a positive share of the voltage span")
 
 
-@dataclass(slots=True)
-class DriftState:
+class DriftState(Numbers):
     """Counters of the filter, and the innovations by which it detects changes."""
 
     fast_V2: Annotated[float, Entry("short-term mean square innovation", "V²", low=0.0)] = 0.0
@@ -209,7 +208,7 @@ DEAD_S = 0.25
 
 
 @shared
-def _expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, bursts: FloatArray) -> None:
+def expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, bursts: FloatArray) -> None:
     """See `DriftFilter.expect_change`; ``bursts`` (p,) V²."""
     walk(x, P, bursts, c.burst_gain**2)
     s.quiet = 0
@@ -241,7 +240,7 @@ def update(
     outcome = "updated"
     threshold = max(c.burst_ratio * s.slow_V2, (c.burst_floor * span_V) ** 2)
     if s.fast_V2 > threshold and s.quiet * step_s > DEAD_S and moving:
-        _expect_change(c, s, x, P, bursts)
+        expect_change(c, s, x, P, bursts)
         outcome = "burst"
     # Limited, so that a change does not raise the long-term level and hide the next change.
     s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, step_s / SLOW_S)
@@ -256,7 +255,7 @@ def update(
     return outcome
 
 
-class DriftFilter:
+class DriftFilter(Numbers):
     """Random-walk Kalman filter on ``beta`` (p,), in V per normalised input.
 
     Parameters
@@ -264,6 +263,7 @@ class DriftFilter:
     config : frozen configuration.
     beta : (p,) initial estimate, and covariance : (p, p) its covariance, V².
     step_s : time between two updates, s. span_V : the model's voltage span, V.
+    record, arrays : where its numbers and its two arrays are kept; of its own unless given.
     """
 
     _x: Annotated[FloatArray, Entry("linear part", "V", "p", name="beta")]
@@ -271,7 +271,14 @@ class DriftFilter:
     state: Annotated[DriftState, Entry("counters of the filter", name="")]
 
     def __init__(
-        self, config: DriftConfig, beta: FloatArray, covariance: FloatArray, step_s: float, span_V: float
+        self,
+        config: DriftConfig,
+        beta: FloatArray,
+        covariance: FloatArray,
+        step_s: float,
+        span_V: float,
+        record: Any = None,
+        arrays: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         p = beta.shape[0]
         if covariance.shape != (p, p):
@@ -279,9 +286,10 @@ class DriftFilter:
         self.config = config
         self.step_s = step_s
         self.span_V = span_V
-        self.state = DriftState(slow_V2=(config.noise * span_V) ** 2, fast_V2=0.0)
-        self._x = np.array(beta, dtype=np.float64)
-        self._P = np.array(covariance, dtype=np.float64, order="C")
+        self.record = np.zeros((), record_of(DriftFilter)) if record is None else record
+        self.state = DriftState(slow_V2=(config.noise * span_V) ** 2)
+        self._x, self._P = arrays or (np.empty(p), np.empty((p, p)))
+        self._x[:], self._P[:] = beta, covariance
         self._k, self._row = np.empty(p), np.empty(p)
         walk, burst = np.full(p, config.shape_walk), np.zeros(p)
         walk[0], burst[0] = config.offset_walk, config.burst_offset
@@ -336,7 +344,7 @@ class DriftFilter:
 
     def expect_change(self) -> None:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""
-        _expect_change(self.config, self.state, self._x, self._P, self._burst)
+        expect_change(self.config, self.state, self._x, self._P, self._burst)
 
     def mark(self) -> Mark:
         """The estimate as copies, for `restore` and `go_back`."""
@@ -368,8 +376,7 @@ FASTEST_PER_S = 0.02
 STILL_PER_S = 0.1
 
 
-@dataclass(slots=True)
-class RestCreep:
+class RestCreep(Numbers):
     """Creep of a stage at rest, and the move of the frame that compensates it.
 
     To hold a creeping stage in place, the controller slowly reverses the voltage, and this reversal changes the stage's

@@ -19,7 +19,7 @@ import numpy as np
 from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureMap
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers
 from dehyst.adaptive.types import Sample
 
 # --- Gates.
@@ -63,6 +63,8 @@ REASONS = (
     NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, RINGING, UNTRUSTED, SETTLING, SATURATED, OUT_OF_RANGE,
     UNEXCITED, OUTLIER, REDUNDANT, FROZEN, NUMERICS,
 )  # fmt: skip
+#: Results of a sample; compiled code has their numbers.
+OUTCOMES = (LEARNT, PASSED, *REASONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +125,7 @@ class AdmissionConfig:
         return replace(self, glitch_share=self.glitch_share * wider, surprise_share=self.surprise_share * wider)
 
 
-@dataclass(slots=True)
-class AdmissionState:
+class AdmissionState(Numbers):
     """What the gates remember of the samples so far."""
 
     seq: Annotated[int, Entry("the last sample taken", low=-1)] = -1
@@ -194,11 +195,6 @@ def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: flo
     if not config.y_min_um <= y_um <= config.y_max_um:
         return OUT_OF_RANGE
     return ""
-
-
-def new_counters() -> dict[str, int]:
-    """All outcomes at zero, so that a report lists every gate."""
-    return dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
 
 
 @shared

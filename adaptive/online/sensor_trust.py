@@ -38,7 +38,7 @@ from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.glitch_or_jump import Circumstances, tolerance_um
 from dehyst.adaptive.online.track import Reckoning, drive_V
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers
 from dehyst.adaptive.types import FloatArray
 
 # --- The check that always runs.
@@ -73,8 +73,7 @@ STEP_STILL, STILL_STEPS = 0.2, 4
 CONFIRMED = 10
 
 
-@dataclass(slots=True)
-class Following:
+class Following(Numbers):
     """Check of readings that pass the gates: sums over the last steps.
 
     Each step is a vector (u, p), scaled so that its larger component is 1 or -1.
