@@ -347,7 +347,8 @@ def _check(part: Any, values: dict[str, Any]) -> None:
             raise Refused.by_check(error) from error
     for slot in _slots(_type(part)):
         if slot.kind == "part":
-            _check(getattr(part, slot.field), values[slot.field])
+            with within(f"{slot.name}." if slot.name else ""):
+                _check(getattr(part, slot.field), values[slot.field])
 
 
 def _put(part: Any, values: dict[str, Any]) -> None:

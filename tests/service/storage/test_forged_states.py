@@ -120,7 +120,7 @@ def test_no_motion_and_no_voltage_beyond_all_measure_is_taken() -> None:
                 forged.flat[-1] = wild
             with pytest.raises(ModelFileError, match=row.name.replace("N.", "0.")):
                 axis.restore(through_a_file(state) | {name: forged})
-    assert {"front.hold.shift_um", "front.trial.window", "front.past0.motion", "filter.beta"} <= seen
+    assert {"front.hold.shift_um", "front.trial.window", "front.past_motion", "filter.beta"} <= seen
     assert len(seen) > 60
 
 
