@@ -220,9 +220,16 @@ def update(
     c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, walks: FloatArray, bursts: FloatArray, span_V: float,
     step_s: float, basis: FloatArray, target_V: float, moving: bool, k: FloatArray, row: FloatArray,
 ) -> str:  # fmt: skip
-    """See `DriftFilter.update`. ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V².
+    """Update with one measurement ``target_V`` of ``basis' x``; ``basis`` (p,).
 
-    x (p,), P (p, p) change in place; k, row (p,) are scratch.
+    Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
+
+    At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the same
+    basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at one
+    position would change the model at all others, and would give too much weight to the next motion's first samples.
+
+    ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V². x (p,), P (p, p) change in place;
+    k, row (p,) are scratch.
     """
     if moving:
         innovation, variance = _walk_and_innovation(x, P, walks, c.gain_walk**2 * step_s, basis, target_V, row)
@@ -290,7 +297,6 @@ class DriftFilter(Numbers):
         self.state = DriftState(slow_V2=(config.noise * span_V) ** 2)
         self._x, self._P = arrays or (np.empty(p), np.empty((p, p)))
         self._x[:], self._P[:] = beta, covariance
-        self._k, self._row = np.empty(p), np.empty(p)
         walk, burst = np.full(p, config.shape_walk), np.zeros(p)
         walk[0], burst[0] = config.offset_walk, config.burst_offset
         if p >= MOTION_COLUMNS:
@@ -313,34 +319,6 @@ class DriftFilter(Numbers):
     def variances(self) -> tuple[FloatArray, FloatArray]:
         """(p,) variances that each coefficient gains with a step, and with a sudden change, V²."""
         return self._walk.copy(), self._burst.copy()
-
-    def update(self, basis: FloatArray, target_V: float, moving: bool) -> str:
-        """Update with one measurement ``target_V`` of ``basis' beta``; ``basis`` (p,).
-
-        Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
-
-        At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the
-        same basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at
-        one position would change the model at all others, and would give too much weight to the next motion's first
-        samples.
-        """
-        x, P, walk, burst = self._x, self._P, self._walk, self._burst
-        span_V, step_s = self.span_V, self.step_s
-        return update(
-            self.config,
-            self.state,
-            x,
-            P,
-            walk,
-            burst,
-            span_V,
-            step_s,
-            basis,
-            target_V,
-            moving,
-            self._k,
-            self._row,
-        )
 
     def expect_change(self) -> None:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""

@@ -155,9 +155,9 @@ class Intake(Numbers):
         self.reckoned_seq = -1
         self._hold, self._trial, self.lost = None, None, True
         self._proven = self._proven_past = None
-        self._forget()
+        self.forget()
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
         """Forget how the readings followed so far."""
         self.following.forget()
         self.past_count, self._control = 0, None
@@ -259,7 +259,7 @@ class Intake(Numbers):
         self._hold, self._trial, self.lost = None, None, False
         self._proven_past = None
         self.gates.restart()
-        self._forget()
+        self.forget()
         self.track.begin(sample.y_um)
         self.restarts += 1
         return Taken(why, (Step(sample.y_um, sample.u_V),))
@@ -391,7 +391,7 @@ class Intake(Numbers):
         track.move(frame, slope, shift_um)
         hold.take(slope, shift_um)
         self.rings = False
-        self._forget()
+        self.forget()
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
             # It rings about the new level: the frame is right, wait for settled readings.
             return Taken(admission.RINGING, (), away_um, first=first)
@@ -433,7 +433,7 @@ class Intake(Numbers):
         self._hold, self._proven, self.missing = None, None, None
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), by_voltages=not self._judges)
         self.trials += 1
-        self._forget()
+        self.forget()
         return Taken(admission.UNTRUSTED, distrusted=True)
 
     def take_tried(self, sample: Sample, before_V: float, missing: int, refused: str) -> Taken:
@@ -502,11 +502,6 @@ class Intake(Numbers):
             return self.served.memory_in(self.base.features, memory) if frozen else memory.copy()
         return self.track.memory_now(frozen)
 
-    @property
-    def controls(self) -> bool:
-        """Whether a control trial of the model is under way."""
-        return self._control is not None
-
     # ---- beside the smoother
 
     def go_along(self, u_V: float) -> None:
@@ -534,10 +529,6 @@ class Intake(Numbers):
         self.missing = None
         self._hold, self._proven, self._proven_past = None, None, None
         self.undone += 1
-
-    def forget_motion(self) -> None:
-        """Motion from before and after a jump cannot be compared."""
-        self._forget()
 
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""

@@ -226,10 +226,6 @@ class ResidualWindow:
         """The share of it that is served, V."""
         return self._share.share * self._window.predict(kernel)
 
-    def weigh(self, kernel_V: float, left_V: float, step_s: float) -> None:
-        """Take one measurement for the share; see `KernelShare.take`."""
-        self._share.take(kernel_V, left_V, step_s)
-
     def learn(self, kernel: FloatArray, target_V: float) -> str:
         """Learn one sample. Returns "learnt", or "numerics" where the step was refused and undone.
 

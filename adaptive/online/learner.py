@@ -19,6 +19,7 @@ from dehyst.adaptive.errors import DehystError, ModelFileError
 from dehyst.adaptive.features import ACCELERATION, VELOCITY, FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.online import step as order
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
 from dehyst.adaptive.online.gates import OUTCOMES
@@ -26,28 +27,7 @@ from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, level_of
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import KernelShare, ResidualWindow
 from dehyst.adaptive.online.row import Row
-from dehyst.adaptive.online.step import (
-    ADVANCE,
-    ADVANCED,
-    CHECK,
-    CONTROLLED,
-    DISTRUSTED,
-    DONE,
-    FORGET,
-    GAPPED,
-    HEALING,
-    ILL,
-    LEARN,
-    MARK_S,
-    REFERENCE_S,
-    ROLLED_BACK,
-    SAMPLE,
-    TEACH,
-    TRIED,
-    Judgement,
-    go_on,
-    handle,
-)
+from dehyst.adaptive.online.step import SAMPLE, Judgement
 from dehyst.adaptive.online.track import MissingMotion, Reckoning, Step, answers, drive_V
 from dehyst.adaptive.smoothing import smoother_of
 from dehyst.adaptive.state import Entry, Numbers, record_of, restore, save, within
@@ -104,8 +84,8 @@ def config_record(config: LearnerConfig, dt_s: float) -> Any:
     checks = max(1, round(CHECK_S / step_s))
     steps = {
         "dt_s": float(dt_s), "step_s": float(step_s), "check_s": float(checks * step_s),
-        "check_every": checks * config.filter_every, "mark_every": max(1, round(MARK_S / step_s)),
-        "reference_every": max(1, round(REFERENCE_S / step_s)), "window_every": config.window_every,
+        "check_every": checks * config.filter_every, "mark_every": max(1, round(order.MARK_S / step_s)),
+        "reference_every": max(1, round(order.REFERENCE_S / step_s)), "window_every": config.window_every,
         "fifo": config.eviction == "fifo", "lag": config.smoother(dt_s).lag,
     }  # fmt: skip
     given = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
@@ -365,9 +345,7 @@ NUMBERS: Final = np.dtype([
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     """Load or compile every step of a learner, on parts that are thrown away."""
     parts = Parts(base, config)
-    basis, kernel = np.empty(base.features.basis_size), np.empty(base.features.kernel_size)
-    base.features.fill(0.0, 0.0, 0.0, base.rest_memory(0.0), basis, kernel)
-    window = parts.window
+    window, kernel = parts.window, np.zeros(base.features.kernel_size)
     window.predict(kernel)
     if len(window) < config.window:
         window.learn(10.0 + np.zeros_like(kernel), 0.0)
@@ -381,8 +359,6 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     gap.correct((y, 0.0, 0.0), 0.0, 1.0)
     level_of(np.arange(8.0) % 3.0, 1.0)
     window.with_hyperparameters(window.hyper).newest_error_V(1)
-    for moving in (True, False):
-        parts.filter.update(basis, 0.0, moving)
     parts.filter.expect_change()
     Learner(base, config).handle(Sample(0, 0.0, 0.0, y))
 
@@ -415,10 +391,11 @@ class Learner:
     def handle(self, sample: Sample) -> str:
         """Take one sample. Returns "learnt", "passed" (no step was due), or the name of the gate that refused it."""
         parts, home = self.parts, self.parts.home
-        seq, t_s, u_V, y_um = sample.seq, sample.t_s, sample.u_V, sample.y_um
+        # Of these kinds: others would be compiled for, which takes a minute.
+        seq, t_s, u_V, y_um = int(sample.seq), float(sample.t_s), float(sample.u_V), float(sample.y_um)
         handles = parts.handle, parts.window.handle
-        stage = handle(*handles, home.numbers, home.config, seq, t_s, u_V, y_um, True)
-        if stage != DONE:
+        stage = order.handle(*handles, home.numbers, home.config, seq, t_s, u_V, y_um, True)
+        if stage != order.DONE:
             self.go_on(stage)
         if parts.sample["due"]:
             self._cache = None
@@ -447,7 +424,7 @@ class Learner:
         parts = self.parts
         parts.sample["rare"] = True
         parts.intake.expect(parts.judgement.std_V, parts.judgement.recent_V)
-        if stage <= CONTROLLED:
+        if stage <= order.CONTROLLED:
             stage = self._take(stage)
         self._go_on(stage)
         parts.counters[parts.sample["outcome"]] += 1
@@ -458,12 +435,12 @@ class Learner:
         sample = Sample(t["seq"].item(), t["t_s"].item(), t["u_V"].item(), t["y_um"].item())
         before_V, missing = t["before_V"].item(), t["missing"].item()
         refused = OUTCOMES[t["refused"]] if t["refused"] >= 0 else ""
-        if stage == CONTROLLED:
+        if stage == order.CONTROLLED:
             intake.check_model(sample, self.snapshot)
-            return ADVANCE
-        if stage == TRIED:
+            return order.ADVANCE
+        if stage == order.TRIED:
             taken = intake.take_tried(sample, before_V, missing, refused)
-        elif stage == GAPPED:
+        elif stage == order.GAPPED:
             taken = intake.after_gap(sample, missing, self.snapshot)
         else:
             taken = intake.take_held(sample, before_V, missing, refused, t["limit"].item(), self.snapshot)
@@ -479,52 +456,52 @@ class Learner:
         for step in taken.steps[:-1]:
             self._go_on(self._begin(step, not taken.refused))
         if not taken.steps:
-            return DONE
+            return order.DONE
         return self._begin(taken.steps[-1], not taken.refused)
 
     def _begin(self, step: Step, teaches: bool) -> int:
         t = self.parts.sample
         t["y_um"], t["u_V"], t["good"], t["teaches"] = *step, teaches
-        return ADVANCE
+        return order.ADVANCE
 
     def _go_on(self, stage: int) -> None:
         """From ``stage`` on to the end."""
         parts, intake = self.parts, self.parts.intake
         handles, home = parts.handle, parts.home
-        while stage != DONE:
-            if stage == ADVANCED:
+        while stage != order.DONE:
+            if stage == order.ADVANCED:
                 stage = self._beside_the_smoother()
-            elif stage == ROLLED_BACK:
+            elif stage == order.ROLLED_BACK:
                 parts.roll_back()
-                stage = CHECK
-            elif stage == DISTRUSTED:
-                stage = LEARN
+                stage = order.CHECK
+            elif stage == order.DISTRUSTED:
+                stage = order.LEARN
                 if intake.distrust(self.snapshot):
                     self._go_on_without_readings()
                     stage = self._end(admission.UNTRUSTED)
-            elif stage == FORGET:
-                intake.forget_motion()
-                stage = LEARN
-            elif stage == HEALING:
+            elif stage == order.FORGET:
+                intake.forget()
+                stage = order.LEARN
+            elif stage == order.HEALING:
                 stage = self._end(parts.window.learn(parts.point, parts.sample["target_V"].item()))
                 parts.note_healing()
-            elif stage == ILL:
+            elif stage == order.ILL:
                 parts.window.begin_healing()
                 parts.note_healing()
-                stage = DONE
+                stage = order.DONE
             else:
-                stage = go_on(handles, parts.window.handle, home.numbers, home.config, stage, True)
+                stage = order.go_on(handles, parts.window.handle, home.numbers, home.config, stage, True)
 
     def _end(self, outcome: str) -> int:
         self.parts.sample["outcome"] = OUTCOMES.index(outcome)
-        return DONE
+        return order.DONE
 
     def _beside_the_smoother(self) -> int:
         """The smoother has made a step beside something rare. Returns the stage at which the sample goes on."""
         intake, t = self.parts.intake, self.parts.sample
         intake.go_along(t["u_V"].item())
         if not t["teaches"]:
-            return DONE
+            return order.DONE
         pair = intake.track.pair()
         if pair is None:
             return self._end(admission.SETTLING)
@@ -533,7 +510,7 @@ class Learner:
             self._cache = None
             if missing:
                 return self._end(admission.GAP)
-        return TEACH
+        return order.TEACH
 
     def _go_on_without_readings(self) -> None:
         """The readings are on trial from now on."""
