@@ -366,7 +366,8 @@ class Intake(Numbers):
             return Taken("", hypotheses.steps_of_motion(hold))
         if hold.seen_um > self._admission.glitch_share * self.range_um and not (hold.taken or hold.rang):
             self.gates.note_glitch()
-        self.calm = -len(hold.y_um) if len(hold.y_um) > 1 else self.calm
+        if hold.seen_um > 0.0:
+            self.calm = -len(hold.y_um)
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
 
     def _give_up(self, sample: Sample, hold: Hold) -> Taken:

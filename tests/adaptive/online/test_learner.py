@@ -355,3 +355,18 @@ def test_a_kernel_part_of_other_motion_is_given_up_and_a_good_one_kept(model: Ls
     assert other.learner.parts.window.share < 0.2 < 0.9 < own.learner.parts.window.share
     assert other.mae(2.0, 3.0) > 10.0 * own.mae(2.0, 3.0)
     assert other.mae(5.0, 6.0) < 2.0 * own.mae(5.0, 6.0)
+
+
+def test_a_missing_reading_leaves_the_others_as_an_anchor(model: LssvmInverse, quiet: Run) -> None:
+    """Only a hold with a wrong reading puts those before the next one in doubt; else dead reckoning would begin again
+    at a place that grows older with every missing reading."""
+    learner, lag = Learner.from_model(model), 0
+    for k in range(1200):
+        missing = k > 1000 and k % 2 == 0
+        y_um = math.nan if missing else float(quiet.y[k]) + 6.0 * (k == 900)
+        learner.handle(Sample(k, k * DT, float(quiet.u[k]), y_um))
+        lag = learner.parts.intake.track.lag
+        if k == 905:
+            assert learner.parts.intake.calm < 10
+    assert learner.counters()["not_finite"] == 99
+    assert learner.parts.intake.calm > 2 * lag
