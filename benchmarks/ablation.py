@@ -70,9 +70,8 @@ from benchmarks.records import add_line, read_lines
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates, glitch_or_jump, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
+from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig, Judgement
 from dehyst.adaptive.online.intake import Intake
-from dehyst.adaptive.online.step import Judgement
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.lab.rehearsal import (
     SENSOR,
@@ -328,10 +327,10 @@ RULES: Final = (
         Text("drift", "return -min(max(gained_um", "return 0.0 * min(max(gained_um"),)),
     Rule("envelope refuses frames", ((EnvelopeConfig, "refuses", _always("")),)),
     Rule("fall back to the frozen model", source=(
-        Text("step", "if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:", "if False:"),)),
+        Text("gates", "if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:", "if False:"),)),
     Rule("roll back to a mark", source=(
         Text("step", "ROLLBACK_S, MARK_S, REFERENCE_S = 0.5,", "ROLLBACK_S, MARK_S, REFERENCE_S = 1e300,"),)),
-    Rule("validity", source=(Text("step", "if self.valid and rms > leave_V:", "if False:"),)),
+    Rule("validity", source=(Text("gates", "if self.valid and rms > leave_V:", "if False:"),)),
     Rule("doubt after a jump", ((Judgement, "add_doubt", _nothing),)),
     Rule("a sudden change is detected", source=(Text("drift", "DEAD_S = 0.25", "DEAD_S = 1e300"),)),
     Rule("a jump opens the filter", source=(

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -174,34 +173,23 @@ class CompiledWindows:
 
     def __init__(self, starts: Sequence[WindowArrays]) -> None:
         """``starts`` : what each window begins as."""
-        #: What windows begin as whose matrices are not written yet. It would take seconds to write all of them at once.
-        self.unwritten = dict(enumerate(starts))
-        small = (name for name in WindowArrays._fields if name not in ("P", "R", "kept"))
-        self._all = {name: np.array([getattr(start, name) for start in starts]) for name in small}
-        # They take memory as they are written: ``kept``, in the inverse form, never.
+        names = [name for name in WindowArrays._fields if name != "kept"]
+        self._all = {name: np.array([getattr(start, name) for start in starts]) for name in names}
+        # It takes memory as it is written: in the inverse form, never.
         self._all["kept"] = np.zeros((len(starts), starts[0].kept.size))
-        matrices = np.empty((len(starts), 2, *starts[0].P.shape))
         self._views = [
-            WindowArrays(*pair, **{name: field[axis] for name, field in self._all.items()})
-            for axis, pair in enumerate(matrices)
+            WindowArrays(**{name: field[axis] for name, field in self._all.items()}) for axis in range(len(starts))
         ]
         for view in self._views:
             ws.forget_kept(view)
         self.handles = np.array([ws.handle_of(view) for view in self._views])
 
-    def write(self, axes: Iterable[int]) -> None:
-        """Write the matrices that the windows of ``axes`` begin with, where they are not yet. No step before that."""
-        for axis in self.unwritten.keys() & axes:
-            start = self.unwritten.pop(axis)
-            self._views[axis].P[...], self._views[axis].R[...] = start.P, start.R
-
     def arrays(self, axis: int) -> WindowArrays:
-        """The solver's state of an axis: views, stepped in place by whoever has them, after `write`."""
+        """The solver's state of an axis: views, stepped in place by whoever has them."""
         return self._views[axis]
 
     def put(self, axis: int, arrays: WindowArrays) -> None:
         """Take over the state of a solver."""
-        self.unwritten.pop(axis, None)
         ws.take_over(self._views[axis], arrays)
 
     def samples(self) -> dict[str, FloatArray]:
@@ -210,10 +198,6 @@ class CompiledWindows:
 
 
 # --- The fleet.
-
-
-#: Samples within which the matrices of all windows are written.
-WRITTEN_WITHIN = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +268,7 @@ class Fleet:
         Returns (B,) results: the number of the outcome in ``OUTCOMES``, NO_SAMPLE for an axis that is not present.
         Never raises on the values of samples; raises InputError on shapes.
         """
-        w, windows = self._numbers["sample"], self._windows
+        w = self._numbers["sample"]
         for name, given in (("seq", seq), ("t_s", t_s), ("u_V", u_V), ("y_um", y_um), ("present", present)):
             values = np.asarray(given)
             if values.shape not in ((), (self.axes,)):
@@ -294,11 +278,6 @@ class Fleet:
         axes = np.flatnonzero(w["present"])
         if axes.size:
             self._let_check(axes)
-            if windows.unwritten:
-                # With its next sample the smoother may have its first instant, and the window its first step.
-                track = self._numbers["intake"]["track"]["count"]
-                windows.write(axes[track[axes] >= self._config["lag"]].tolist())
-                windows.write(list(islice(windows.unwritten, -(-self.axes // WRITTEN_WITHIN))))
             rare = self._through(axes, TAKE)
             if rare or w["due"].any():
                 self._cache = None
@@ -340,7 +319,7 @@ class Fleet:
                 self._arrays["counters"][done, w["outcome"][done]] += 1
         for axis in rare:
             if axis >= 0:
-                self._own(axis).go_on(int(w["stage"][axis]))
+                self.learner_of(axis).go_on(int(w["stage"][axis]))
                 self._take_window(axis)
         return bool(rare)
 
@@ -410,7 +389,7 @@ class Fleet:
         seq, valid = n["intake"]["gates"]["seq"].copy(), n["judgement"]["valid"].copy()
         # Where a gap or a fault is open, or the identified model is served, the model is made one by one.
         alone = n["intake"]["trial"] | n["intake"]["missing"] | n["judgement"]["fallback"]
-        one_by_one = {axis: self._own(axis).snapshot() for axis in np.flatnonzero(alone).tolist()}
+        one_by_one = {axis: self.learner_of(axis).snapshot() for axis in np.flatnonzero(alone).tolist()}
         for axis, model in (one_by_one | self.held).items():
             row, of = model.packed
             packed[axis, : row.size], counts[axis] = row, of
@@ -446,11 +425,6 @@ class Fleet:
 
     def learner_of(self, axis: int) -> Learner:
         """The learner of an axis, to look into."""
-        self._windows.write([axis])
-        return self._own(axis)
-
-    def _own(self, axis: int) -> Learner:
-        """The same, where its window may not be written yet."""
         learner = self._learners[axis]
         learner.look_again()
         if not self._windows.shares:

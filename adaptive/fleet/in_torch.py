@@ -8,8 +8,8 @@ because batched products do not use a triangle; the update is symmetric to the l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,6 @@ class TorchWindows:
     """Windows of B axes. See `adaptive.fleet.fleet.CompiledWindows`."""
 
     shares = False
-    #: All matrices are written from the start; see `CompiledWindows.unwritten`.
-    unwritten: Final[dict[int, WindowArrays]] = {}
 
     def __init__(
         self, starts: Sequence[WindowArrays], rows: Mapping[str, Any], numbers: Any, fifo: bool, device: str
@@ -44,9 +42,6 @@ class TorchWindows:
         self.handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
         for start in {id(start): start for start in starts}.values():
             self.put([axis for axis, other in enumerate(starts) if other is start], start)
-
-    def write(self, axes: Iterable[int]) -> None:
-        """Nothing: the matrices are written."""
 
     def _to(self, array: Any) -> Tensor:
         return torch.as_tensor(array).to(self._device)

@@ -25,7 +25,7 @@ from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online import glitch_or_jump as hypotheses
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.gates import AdmissionState
+from dehyst.adaptive.online.gates import AdmissionState, Judgement
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from dehyst.adaptive.online.row import Row
 from dehyst.adaptive.online.sensor_trust import STILL_STEPS, Following, Outcome, Trial
@@ -81,8 +81,9 @@ def is_known(known: FloatArray, slope: float, bend: float) -> bool:
 
 
 class Intake(Numbers):
-    """The intake of a learner; ``base`` is the identified model."""
+    """The intake of a learner; ``base`` is the identified model. judgement : of the errors of the served model."""
 
+    judgement: Judgement
     gates: Annotated[AdmissionState, Entry("state of the gates")]
     known: Annotated[
         FloatArray, Entry("largest rates of the voltage learnt: at the two good estimates, now", "V/s, V/s²", "3,2")
@@ -123,8 +124,6 @@ class Intake(Numbers):
         self.gates = AdmissionState()
         self.following = Following()
         self.track = Track(record["track"], row, base.features, self.smoother.config.lag)
-        # Standard deviation of the model's predictions as of the last sample, V; that of the most recent ones.
-        self._doubt_V = self._recent_V = 0.0
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
         self._envelope = config.envelope
@@ -179,10 +178,6 @@ class Intake(Numbers):
 
     # ---- what a sample is
 
-    def expect(self, doubt_V: float, recent_V: float) -> None:
-        """Standard deviation of the model's predictions before this sample, V, and of the most recent ones."""
-        self._doubt_V, self._recent_V = doubt_V, recent_V
-
     def take_held(
         self, sample: Sample, before_V: float, missing: int, refused: str, limit: float, model: Model
     ) -> Taken:
@@ -224,7 +219,7 @@ class Intake(Numbers):
         seconds = (missing + 1) * self.dt_s if missing else UNKNOWN_S
         self.missing = gap = MissingMotion.begin(
             self._of_track(model()), track.memory, from_um, sample.y_um, sample.u_V, seconds,
-            self._recent_V, earlier,
+            self.judgement.recent_V, earlier,
         )  # fmt: skip
         track.remember(gap.memory)
         return taken
@@ -333,7 +328,7 @@ class Intake(Numbers):
         """What readings are judged by; ``limit`` : distance, in ranges, up to which one is no surprise."""
         c, gates, served = self._admission, self.gates, self.served
         usual = max(limit, c.surprise_share)
-        usual += min(2.0 * self._doubt_V / self.base.span_V, c.glitch_share)
+        usual += min(2.0 * self.judgement.std_V / self.base.span_V, c.glitch_share)
         return Circumstances(
             config=c,
             envelope=self._envelope,

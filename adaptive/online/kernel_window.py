@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -122,44 +122,23 @@ class ResidualWindow:
         self._share.share, self._share.kernel_variance = 1.0, model.kernel_variance
 
     @classmethod
-    def from_model(
-        cls,
-        model: LssvmInverse,
-        capacity: int,
-        eviction: Eviction = "nearest",
-        solver: SolverConfig | None = None,
-        share: KernelShare | None = None,
-        born: IntArray | None = None,
-    ) -> ResidualWindow:
-        """A window that holds a model's samples and predicts as its kernel part does; the last ``capacity`` of them."""
-        made = cls(capacity, model, eviction, solver, None, share, born)
+    def from_model(cls, model: LssvmInverse, capacity: int, *others: Any) -> ResidualWindow:
+        """A window that holds a model's samples and predicts as its kernel part does; the last ``capacity`` of them.
+
+        ``others`` : as of the constructor; ``arrays`` that are given hold the samples already.
+        """
+        made = cls(capacity, model, *others)
         n = model.support.shape[0]
-        if n:
+        if n and not len(made):
             # The targets follow from the solution: y = K alpha + alpha / gamma. Its bias is in the linear part.
             targets = features.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
-        return made._begun()
-
-    @classmethod
-    def over(
-        cls,
-        arrays: WindowArrays,
-        model: LssvmInverse,
-        eviction: Eviction,
-        solver: SolverConfig,
-        share: KernelShare | None = None,
-        born: IntArray | None = None,
-    ) -> ResidualWindow:
-        """A window whose state is in arrays that another owns, as it begins with ``model``."""
-        return cls(arrays.S.size, model, eviction, solver, arrays, share, born)._begun()
-
-    def _begun(self) -> ResidualWindow:
-        """Itself, with a share of 1; the weight of this start is the mean square of the kernel part at its samples."""
-        if len(self._window):
-            self._share.product_V2 = self._share.square_V2 = float(np.mean(self._at_samples_V**2))
-        return self
+        if len(made):
+            # The weight of a share of 1 is the mean square of the kernel part at its samples.
+            made._share.product_V2 = made._share.square_V2 = float(np.mean(made._at_samples_V**2))
+        return made
 
     def __len__(self) -> int:
         return len(self._window)

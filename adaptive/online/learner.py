@@ -22,12 +22,12 @@ from dehyst.adaptive.online import gates as admission
 from dehyst.adaptive.online import step as order
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
-from dehyst.adaptive.online.gates import OUTCOMES
+from dehyst.adaptive.online.gates import OUTCOMES, Judgement
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, level_of
 from dehyst.adaptive.online.intake import Intake
 from dehyst.adaptive.online.kernel_window import KernelShare, ResidualWindow
 from dehyst.adaptive.online.row import Row
-from dehyst.adaptive.online.step import SAMPLE, Judgement
+from dehyst.adaptive.online.step import SAMPLE
 from dehyst.adaptive.online.track import MissingMotion, Reckoning, Step, answers, drive_V
 from dehyst.adaptive.smoothing import smoother_of
 from dehyst.adaptive.state import Entry, Numbers, record_of, restore, save, within
@@ -182,10 +182,8 @@ class Parts(Numbers):
         row.walks[:], row.bursts[:] = self.filter.variances
         self.first = self.filter.mark()
         c, share = config, self.share
-        if home.window is None:
-            self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver, share, row.born)
-        else:
-            self.window = ResidualWindow.over(home.window, base, c.eviction, c.solver, share, row.born)
+        own = home.window, share, row.born
+        self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver, *own)
         self.mark_beta, self.mark_covariance, self.references = row.mark_beta, row.mark_covariance, row.references
         self._mark_now()
         self.domain, self.point, self.delay, self.counters = row.domain, row.point, row.delay, row.counters
@@ -195,10 +193,10 @@ class Parts(Numbers):
         self.rest = RestCreep()
         # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
         self.allowed_V = c.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
-        f, own = base.features, numbers["fixed"]
-        own["middle_um"], own["range_um"] = 0.5 * (f.y_max_um + f.y_min_um), f.y_max_um - f.y_min_um
-        own["span_V"], own["drive_V"], own["tells"] = base.span_V, drive_V(base), answers(base)
-        own["allowed_V"] = self.allowed_V
+        f, fixed = base.features, numbers["fixed"]
+        fixed["middle_um"], fixed["range_um"] = 0.5 * (f.y_max_um + f.y_min_um), f.y_max_um - f.y_min_um
+        fixed["span_V"], fixed["drive_V"], fixed["tells"] = base.span_V, drive_V(base), answers(base)
+        fixed["allowed_V"], self.intake.judgement = self.allowed_V, self.judgement
 
     def roll_back(self) -> None:
         """The identified model was better for long: take back what was learnt since the last good estimate, and jumps
@@ -376,6 +374,10 @@ class Learner:
         self.parts = Parts(model, config, home)
         self._cache: LssvmInverse | None = None
 
+    def __reduce__(self) -> Any:
+        # Addresses are valid for one object only: a copy makes its own.
+        return type(self).from_state, (self.state_dict(),)
+
     @classmethod
     def from_model(cls, model: LssvmInverse, config: LearnerConfig | None = None) -> Learner:
         """A learner that starts from an identified model."""
@@ -423,7 +425,6 @@ class Learner:
         """What is rare about a sample that the compiled order has left at ``stage``, and the rest of its way."""
         parts = self.parts
         parts.sample["rare"] = True
-        parts.intake.expect(parts.judgement.std_V, parts.judgement.recent_V)
         if stage <= order.CONTROLLED:
             stage = self._take(stage)
         self._go_on(stage)

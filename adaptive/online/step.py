@@ -7,119 +7,28 @@ are functions of the modules that declare their state.
 
 from __future__ import annotations
 
-from math import isfinite, nan, sqrt
-from typing import Annotated, Any, Final
+from math import isfinite, nan
+from typing import Any, Final
 
 import numpy as np
 
-from dehyst.adaptive.compiled import compiled, dot, shared
+from dehyst.adaptive.compiled import compiled, dot
 from dehyst.adaptive.features import FeatureArrays, advance, fill
 from dehyst.adaptive.inverse_model import mean_of, unpacked
 from dehyst.adaptive.online import gates
 from dehyst.adaptive.online import kernel_window as window
 from dehyst.adaptive.online.drift import RestCreep, expect_change, update
-from dehyst.adaptive.online.gates import OUTCOMES, AdmissionState
+from dehyst.adaptive.online.gates import OUTCOMES, AdmissionState, Judgement
 from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED
 from dehyst.adaptive.online.intake import FAR_OUT, is_known
 from dehyst.adaptive.online.kernel_window import KernelShare
 from dehyst.adaptive.online.row import Row, row_of
 from dehyst.adaptive.online.sensor_trust import CONFIRMED, STILL_STEPS, Following
 from dehyst.adaptive.smoothing import smooth_one
-from dehyst.adaptive.state import Entry, Numbers
 from dehyst.adaptive.types import BoolArray, FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
 from dehyst.adaptive.window.arrays import WindowArrays, arrays_of
-
-# --- Errors of the served model: whether it is valid, and whether the identified one predicts better.
-#
-# The error is the measured voltage minus the voltage that the model gives for the measured motion, before the sample is
-# learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
-
-
-#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
-LONG_S, SHORT_S = 2.0, 0.1
-
-#: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
-FALLBACK_RATIO = 1.3
-
-
-class Judgement(Numbers):
-    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model."""
-
-    long_V2: Annotated[float, Entry("mean square error of the learner over long time", "V²", low=0.0)]
-    short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
-    frozen_V2: Annotated[float, Entry("mean square error of the identified model over long time", "V²", low=0.0)]
-    frozen_short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
-    error_V: Annotated[float, Entry("the learner's last error", "V")] = 0.0
-    judged: Annotated[int, Entry("errors", low=0)] = 0
-    inside: Annotated[int, Entry("errors within one stated standard deviation", low=0)] = 0
-    valid: Annotated[bool, Entry("whether the learnt model is valid")] = True
-    fallback: Annotated[bool, Entry("whether the identified model is served because it predicts better")] = False
-    fallen_s: Annotated[float, Entry("for how long", "s", low=0.0)] = 0.0
-    doubt_V2: Annotated[float, Entry("extra variance after a jump of open cause; it decays", "V²", low=0.0)] = 0.0
-
-    @shared
-    def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
-        """Take one error of the learnt and of the frozen model, V."""
-        squared = error_V * error_V
-        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
-        if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
-            self.inside += 1
-        self.error_V = error_V
-        self.judged += 1
-        self.long_V2 += (squared - self.long_V2) * slow
-        self.short_V2 += (squared - self.short_V2) * fast
-        self.doubt_V2 *= 1.0 - fast
-        frozen = frozen_error_V * frozen_error_V
-        self.frozen_V2 += (frozen - self.frozen_V2) * slow
-        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
-
-    @shared
-    def decide(self, enter_V: float, leave_V: float) -> bool:
-        """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
-        rms = sqrt(self.short_V2)
-        if self.valid and rms > leave_V:
-            self.valid = False
-        elif not self.valid and rms < enter_V:
-            self.valid = True
-        return self.valid
-
-    @shared
-    def choose(self, floor_V: float, step_s: float) -> bool:
-        """Whether to serve the frozen model: taken when clearly better, left when worse."""
-        learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
-        if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
-            self.fallback = True
-        elif self.fallback and learnt < frozen:
-            self.fallback = False
-        self.fallen_s = self.fallen_s + step_s if self.fallback else 0.0
-        return self.fallback
-
-    @shared
-    def rolled_back(self) -> None:
-        """The learner has returned to an earlier estimate: count the time of the frozen model from zero."""
-        self.fallen_s = 0.0
-
-    def add_doubt(self, variance_V2: float) -> None:
-        """Add to the stated variance for a jump whose cause is open, V²."""
-        self.doubt_V2 += variance_V2
-
-    @property
-    def std_V(self) -> float:
-        """Standard deviation of the learner's predictions, V: the larger of long and short term."""
-        return sqrt(max(self.long_V2, self.short_V2))
-
-    @property
-    def recent_V(self) -> float:
-        """Rms error over the short term, V."""
-        return sqrt(self.short_V2)
-
-    @property
-    def variance_V2(self) -> float:
-        """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
-        return max(self.long_V2, self.short_V2) + self.doubt_V2
-
 
 #: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
 #: marked this often, s. The readings are judged by one that is older, between one and two such times: a newer one has

@@ -522,7 +522,7 @@ class Step(NamedTuple):
 class Pair(NamedTuple):
     """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), and its voltage, V, smoothed alike.
 
-    rates : of that voltage, V/s and V/s². applied_V : the voltages that were applied at that instant and just before
+    applied_V : the voltages that were applied at that instant and just before
     it, V. good : whether the readings at that instant and before it are good.
     """
 
@@ -531,7 +531,6 @@ class Pair(NamedTuple):
     v_um_per_s: float
     a_um_per_s2: float
     u_V: float
-    rates: tuple[float, float]
     applied_V: tuple[float, float]
     good: bool
 
@@ -701,8 +700,7 @@ class Track(Numbers):
         now = self.count - 1 - self.lag
         at, before = now % slots, (now - 1) % slots
         good = bool(self.good[at] and self.good[before])
-        slope, bend = self.rates.tolist()
-        return Pair(now, *motion, self.smooth_V, (slope, bend), (self.u_V.item(at), self.u_V.item(before)), good)
+        return Pair(now, *motion, self.smooth_V, (self.u_V.item(at), self.u_V.item(before)), good)
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""

@@ -25,7 +25,7 @@ from benchmarks.ablation import (
     table,
     worse_rows,
 )
-from dehyst.adaptive.online.step import Judgement
+from dehyst.adaptive.online.gates import Judgement
 
 
 def test_every_rule_replaces_what_is_there_and_every_variant_has_a_name_of_its_own() -> None:

@@ -282,12 +282,9 @@ def test_axes_with_kept_samples_and_fifo_equal_single_learners(models: list[Lssv
     assert min(single.counters()["window_steps"] for single in singles) > 20
 
 
-@pytest.mark.parametrize("settle", [0, 50])
-def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse], settle: int) -> None:
-    """Their matrices are written one after the other, and in any case before a step of the axis needs them."""
-    config = LearnerConfig(window=60, admission=AdmissionConfig(settle=settle))
-    # One control trial at a time: one of the axes has its first step within the batch. With ``settle`` 0 a trial can
-    # begin as soon as an axis has a place.
+def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60)
+    # One control trial at a time: one of the axes has its first step within the batch.
     fleet = Fleet([models[0]] * 900, FleetConfig(config, checks=1))
     u, y = samples(700)
     moving = {3: Learner(models[0], config), 899: Learner(models[0], config)}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -370,3 +372,18 @@ def test_a_missing_reading_leaves_the_others_as_an_anchor(model: LssvmInverse, q
             assert learner.parts.intake.calm < 10
     assert learner.counters()["not_finite"] == 99
     assert learner.parts.intake.calm > 2 * lag
+
+
+def test_a_copy_is_independent_and_goes_on_to_the_last_bit(model: LssvmInverse, quiet: Run) -> None:
+    learner = Learner.from_model(model)
+    rows = [Sample(k, k * DT, float(quiet.u[k]), float(quiet.y[k])) for k in range(900)]
+    for sample in rows[:700]:
+        learner.handle(sample)
+    twins = copy.deepcopy(learner), pickle.loads(pickle.dumps(learner))
+    for one in (learner, *twins):
+        said = [one.handle(sample) for sample in rows[700:]]
+        assert said.count("learnt") > 50
+    expected = learner.state_dict()
+    for twin in twins:
+        got = twin.state_dict()
+        assert all(np.array_equal(np.asarray(got[name]), np.asarray(expected[name])) for name in expected)

@@ -15,8 +15,8 @@ import pytest
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
+from dehyst.adaptive.online.gates import FALLBACK_RATIO, LONG_S, SHORT_S, Judgement
 from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.online.step import FALLBACK_RATIO, LONG_S, SHORT_S, Judgement
 from dehyst.adaptive.state import load, save
 from dehyst.adaptive.types import Sample
 
