@@ -361,6 +361,9 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     Learner(base, config).handle(Sample(0, 0.0, 0.0, y))
 
 
+_NO_SAMPLE: Final = Sample(0, 0.0, 0.0, 0.0)
+
+
 class Learner:
     """Learns one axis online, starting from an identified model. Implements ``adaptive.types.OnlineModel``.
 
@@ -392,11 +395,8 @@ class Learner:
 
     def handle(self, sample: Sample) -> str:
         """Take one sample. Returns "learnt", "passed" (no step was due), or the name of the gate that refused it."""
-        parts, home = self.parts, self.parts.home
-        # Of these kinds: others would be compiled for, which takes a minute.
-        seq, t_s, u_V, y_um = int(sample.seq), float(sample.t_s), float(sample.u_V), float(sample.y_um)
-        handles = parts.handle, parts.window.handle
-        stage = order.handle(*handles, home.numbers, home.config, seq, t_s, u_V, y_um, True)
+        parts = self.parts
+        stage = self._run(order.TAKE, sample)
         if stage != order.DONE:
             self.go_on(stage)
         if parts.sample["due"]:
@@ -468,7 +468,6 @@ class Learner:
     def _go_on(self, stage: int) -> None:
         """From ``stage`` on to the end."""
         parts, intake = self.parts, self.parts.intake
-        handles, home = parts.handle, parts.home
         while stage != order.DONE:
             if stage == order.ADVANCED:
                 stage = self._beside_the_smoother()
@@ -491,7 +490,13 @@ class Learner:
                 parts.note_healing()
                 stage = order.DONE
             else:
-                stage = order.go_on(handles, parts.window.handle, home.numbers, home.config, stage, True)
+                stage = self._run(stage)
+
+    def _run(self, stage: int, sample: Sample = _NO_SAMPLE) -> int:
+        parts, home = self.parts, self.parts.home
+        # Of these kinds: others would be compiled for, which takes a minute.
+        given = int(sample.seq), float(sample.t_s), float(sample.u_V), float(sample.y_um)
+        return int(order.go_on(parts.handle, parts.window.handle, home.numbers, home.config, stage, *given))
 
     def _end(self, outcome: str) -> int:
         self.parts.sample["outcome"] = OUTCOMES.index(outcome)

@@ -379,30 +379,27 @@ def _go_on(A: Row, W: WindowArrays, r: Any, c: Any, first: int, here: bool) -> i
 
 
 @compiled
-def go_on(row: IntArray, own: IntArray, numbers: Any, config: Any, stage: int, here: bool) -> int:
-    """The sample of one axis from ``stage`` on: the stage at which it stops.
-
-    row, own : handles of the row and of the window. numbers, config : arrays of one record. here : whether the window's
-    steps are made here too, not only up to them.
-    """
-    return _go_on(row_of(row), arrays_of(own), numbers[0], config[0], stage, here)
-
-
-@compiled
-def handle(
-    row: IntArray, own: IntArray, numbers: Any, config: Any, seq: int, t_s: float, u_V: float, y_um: float, here: bool
+def go_on(
+    row: IntArray, own: IntArray, numbers: Any, config: Any, stage: int, seq: int, t_s: float, u_V: float, y_um: float
 ) -> int:
-    """`go_on` with a new sample."""
-    t = numbers[0].sample
-    t["seq"], t["t_s"], t["u_V"], t["y_um"], t["checks"] = seq, t_s, u_V, y_um, True
-    return _go_on(row_of(row), arrays_of(own), numbers[0], config[0], TAKE, here)
+    """The sample of one axis from ``stage`` on: the stage at which it stops. From TAKE on it is the one given here.
+
+    row, own : handles of the row and of the window. numbers, config : arrays of one record.
+    """
+    if stage == TAKE:
+        t = numbers[0].sample
+        t["seq"], t["t_s"], t["u_V"], t["y_um"], t["checks"] = seq, t_s, u_V, y_um, True
+    return _go_on(row_of(row), arrays_of(own), numbers[0], config[0], stage, True)
 
 
 @compiled
 def go_on_all(
     lo: int, hi: int, axes: IntArray, rows: IntArray, owns: IntArray, numbers: Any, config: Any, stage: int, here: bool
 ) -> None:
-    """`go_on` with the samples of ``axes[lo:hi]``; the first index of all others is the axis."""
+    """`go_on` with the samples of ``axes[lo:hi]``; the first index of all others is the axis.
+
+    here : whether the steps of the windows are made here too, not only all up to them.
+    """
     for k in range(lo, hi):
         b = axes[k]
         _go_on(row_of(rows[b]), arrays_of(owns[b]), numbers[b], config[0], stage, here)
