@@ -65,7 +65,7 @@ def _interpreted(function: F) -> F:
 def shared(function: F) -> F:
     """A Python function that compiled code may call too: on a record with the fields of the object that it is given.
 
-    So that a fleet steps its axes by the rules of the single learner themselves. Such a function uses attributes,
+    So that the order of a sample is compiled and each rule is with the state that it changes. It uses attributes,
     numbers and other shared or compiled functions, and no methods.
     """
     return register_jitable(function) if COMPILES else function

@@ -84,15 +84,6 @@ def advance(y_um: float, memory: FloatArray, m: FeatureArrays) -> None:  # pragm
 
 
 @compiled
-def advance_both(
-    y_um: float, first: FloatArray, second: FloatArray, m: FeatureArrays
-) -> None:  # pragma: no cover - compiled
-    """:func:`advance` for two memories of one map: passing the map costs more than computing either."""
-    advance(y_um, first, m)
-    advance(y_um, second, m)
-
-
-@compiled
 def fill(
     y_um: float, v: float, a: float, memory: FloatArray, m: FeatureArrays, basis: FloatArray, kernel: FloatArray
 ) -> None:  # pragma: no cover - compiled

@@ -325,10 +325,6 @@ class LssvmInverse(Kinded):
         u_V, std_V, inside = evaluate_point(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts)
         return u_V, std_V, inside
 
-    def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
-        """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
-        return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
-
     def at_bound(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray
     ) -> BoolArray:

@@ -14,14 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cache
 from math import factorial, pi
-from typing import Annotated
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.state import Entry
 from dehyst.adaptive.types import FloatArray
 
 #: Outputs of the smoother: displacement, velocity, acceleration.
@@ -56,24 +54,6 @@ class SmootherConfig:
         """A cut-off that suits the sample rate, and a lag of 1.3 periods of it; a longer lag gains nothing."""
         cutoff = min(cutoff_hz, 0.2 / dt_s)
         return cls(dt_s=dt_s, cutoff_hz=cutoff, lag=max(4, round(1.3 / (cutoff * dt_s))))
-
-
-@dataclass(slots=True)
-class SmootherState:
-    """State of a `FixedLagSmoother`."""
-
-    x: Annotated[FloatArray, Entry("predicted state, in sample units", "µm", "order")]
-    ring: Annotated[FloatArray, Entry("innovation and prediction of each step", "µm", "taps,4")]
-    count: Annotated[int, Entry("steps so far", low=0)] = 0
-
-    def copy(self) -> SmootherState:
-        """An independent copy."""
-        return SmootherState(self.x.copy(), self.ring.copy(), self.count)
-
-    def move(self, slope: float, shift_um: float) -> None:
-        """Go on at another place, y <- slope y + shift. Smoothed instants from before stay where they are."""
-        self.x *= slope
-        self.x[0] += shift_um
 
 
 @compiled
@@ -159,27 +139,8 @@ class FixedLagSmoother:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Names of the dimensions of a `SmootherState`, and of rings of ``lag`` + 2 ``slots``."""
+        """Names of the dimensions of its state, and of rings of ``lag`` + 2 ``slots``."""
         return {"order": self.config.order, "taps": self.config.lag + 1, "slots": self.config.lag + 2}
-
-    def initial_state(self, y_um: float) -> SmootherState:
-        """State at rest at ``y_um`` (µm)."""
-        x = np.zeros(self.config.order)
-        x[0] = y_um
-        return SmootherState(x, np.zeros((self.config.lag + 1, 1 + OUTPUTS)), 0)
-
-    def step(self, state: SmootherState, y_um: float) -> tuple[float, float, float] | None:
-        """Take one sample; return (y_um, v_um_per_s, a_um_per_s2) ``lag`` samples ago, None before there is one."""
-        out = np.empty(OUTPUTS)
-        smooth_one(y_um, state.count, state.x, state.ring, self.transition, self.gain, self.lag_gains, out)
-        state.count += 1
-        if state.count <= self.config.lag:
-            return None
-        return out.item(0), out.item(1) * self.scale.item(1), out.item(2) * self.scale.item(2)
-
-    def skip(self, state: SmootherState) -> tuple[float, float, float] | None:
-        """A missing sample: the filter continues with its own prediction."""
-        return self.step(state, float(state.x[0]))
 
     def run(self, y_um: FloatArray) -> FloatArray:
         """(n,) samples to (n, 3) of y, v, a; row i is the estimate ``lag`` samples before i, from samples 0..i.
@@ -187,8 +148,9 @@ class FixedLagSmoother:
         The first ``lag`` rows, for which there is no such sample, are NaN.
         """
         y = _checked(y_um)
-        state = self.initial_state(float(y[0]))
-        out = _run(y, state.x, state.ring, self.transition, self.gain, self.lag_gains) * self.scale
+        x, ring = np.zeros(self.config.order), np.zeros((self.config.lag + 1, 1 + OUTPUTS))
+        x[0] = y[0]
+        out = _run(y, x, ring, self.transition, self.gain, self.lag_gains) * self.scale
         out[: self.config.lag] = np.nan
         return out
 

@@ -13,9 +13,10 @@ stranger. `restore` does the same for an object that is no dataclass, in place. 
 
 A class whose ``KIND`` is a text says so in an entry of that name, so that none is taken for another.
 
-What a field may be: a number, a truth value, a text; an array; a list or tuple of numbers, stored as an array; a list,
-tuple or deque of arrays or of rows of numbers; a dictionary of numbers or arrays by name; another record, or None; a
-list or tuple of records.
+`Numbers` keep their numbers in a structured array, which compiled code reads and writes too.
+
+What a field may be: a number, a truth value, a text; an array; a list, tuple or deque of numbers or of rows of numbers,
+stored as an array; a dictionary of numbers or arrays by name; another record, or None.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Entry:
         `load` gives no size for stands for one length within a record. "" : one dimension of any length.
     low, high : range of every element. finite : whether NaN and infinities are refused, and numbers beyond MOST_FLOAT.
     name : in the file, where it is not that of the field; "" puts the fields of a record among those of its owner.
-    most : longest dimension, longest text, or most records. among : the texts that are allowed, or the names of counts.
+    most : longest dimension, or longest text. among : the texts that are allowed, or the names of counts.
     """
 
     meaning: str
@@ -87,6 +88,90 @@ class Kinded:
     """A class whose states say of which kind they are."""
 
     KIND: ClassVar[str]
+
+
+class Numbers:
+    """A record whose numbers are in ``record``, a structured array of shape () that compiled code works on too.
+
+    Declared and made as a dataclass is: ``Rest(constant_V=0.0)`` has an array of its own, ``Rest(record=...)`` is a
+    view of another's. What may be None has a truth value there. A class with an ``__init__`` of its own is a part.
+    """
+
+    record: Any
+    _defaults: ClassVar[dict[str, Any]]
+
+    def __init_subclass__(cls) -> None:
+        cls._defaults = {}
+        own: Any = cls
+        for slot in _slots(own):
+            name = slot.field.lstrip("_")
+            if slot.optional:
+                setattr(cls, slot.field, _at_times(name))
+            elif slot.kind == "number":
+                if slot.field in vars(cls):
+                    cls._defaults[slot.field] = vars(cls)[slot.field]
+                setattr(cls, slot.field, _number_in_record(name))
+            elif slot.kind == "record" and issubclass(slot.of, Numbers):
+                setattr(cls, slot.field, _record_in_record(name, slot.of))
+
+    def __init__(self, *values: Any, record: Any = None, **named: Any) -> None:
+        self.record = record
+        if record is None:
+            self.record = np.zeros((), record_of(_type(self)))
+            fields = [slot.field for slot in _slots(_type(self))]
+            given = self._defaults | dict(zip(fields, values, strict=False)) | named
+            if given.keys() != set(fields):
+                raise TypeError(f"{type(self).__name__}: got {', '.join(given)}, expected {', '.join(fields)}")
+            for field, value in given.items():
+                setattr(self, field, value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Numbers) and bool(self.record == other.record)
+
+
+def _number_in_record(name: str) -> property:
+    def read(self: Numbers) -> Any:
+        return self.record[name].item()
+
+    def write(self: Numbers, value: Any) -> None:
+        self.record[name] = value
+
+    return property(read, write)
+
+
+def _record_in_record(name: str, of: Any) -> property:
+    def read(self: Numbers) -> Any:
+        kept = vars(self).get(name)
+        if kept is None:
+            kept = vars(self)[name] = of(record=self.record[name])
+        return kept
+
+    def write(self: Numbers, value: Numbers) -> None:
+        self.record[name] = value.record
+
+    return property(read, write)
+
+
+def _at_times(name: str) -> property:
+    def read(self: Numbers) -> Any:
+        return vars(self)[name] if self.record[name] else None
+
+    def write(self: Numbers, value: Any) -> None:
+        vars(self)[name], self.record[name] = value, value is not None
+
+    return property(read, write)
+
+
+@cache
+def record_of(cls: Any) -> Any:
+    """The structured type that holds the numbers of a class and of its parts by their names; None without any."""
+    fields: list[tuple[str, Any]] = []
+    for slot in _slots(cls):
+        if issubclass(cls, Numbers) and (slot.optional or slot.kind == "number"):
+            fields.append((slot.field.lstrip("_"), bool if slot.optional else slot.of))
+        elif slot.kind in ("record", "part") and not slot.optional and record_of(slot.of) is not None:
+            fields.append((slot.field.lstrip("_"), record_of(slot.of)))
+    return np.dtype(fields, align=True) if fields else None
 
 
 @runtime_checkable
@@ -141,8 +226,8 @@ _NUMBERS: Final = {float: "a finite number", int: "an integer", bool: "a truth v
 
 
 class _Slot(NamedTuple):
-    """A declared field. kind : "number", "array", "values" (numbers stored as an array), "arrays", "named", "record",
-    "part" (an object that is filled in place), or "records". of : the type of its elements. make : of the container."""
+    """A declared field. kind : "number", "array", "values" (numbers stored as an array), "named", "record", or "part"
+    (an object that is filled in place). of : the type of its elements. make : of the container."""
 
     field: str
     name: str
@@ -152,7 +237,6 @@ class _Slot(NamedTuple):
     optional: bool
     make: Any
     shapes: tuple[tuple[int | str, ...], ...]
-    least: int
 
 
 def _type(record: Any) -> Any:
@@ -180,16 +264,13 @@ def _slot(field: str, hint: Any, entry: Entry) -> _Slot:
     elif make is dict:
         kind, made = "named", of[1] if of[1] in _NUMBERS else np.dtype(get_args(get_args(of[1])[1])[0])
     elif make in (list, tuple, deque):
-        kind, made = ("values", of[0]) if of[0] in _NUMBERS else ("records", of[0])
-        if get_origin(of[0]) is tuple:
-            kind, made = "values", get_args(of[0])[0]
-        if get_origin(of[0]) is np.ndarray:
-            kind, made = "arrays", np.dtype(get_args(get_args(of[0])[1])[0])
+        kind, made = "values", of[0] if of[0] in _NUMBERS else get_args(of[0])[0]
     else:
-        kind, made = ("record" if is_dataclass(hint) or issubclass(hint, tuple) else "part"), hint
+        whole = is_dataclass(hint) or issubclass(hint, tuple)
+        whole = whole or (issubclass(hint, Numbers) and hint.__init__ is Numbers.__init__)
+        kind, made = "record" if whole else "part", hint
     name = field.lstrip("_") if entry.name is None else entry.name
-    least = len(of) if make is tuple and Ellipsis not in of else 0
-    return _Slot(field, name, entry, kind, made, optional, make, shapes, least)
+    return _Slot(field, name, entry, kind, made, optional, make, shapes)
 
 
 # --- Saving.
@@ -212,17 +293,14 @@ def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
         elif kind == "array":
             if value is not None:
                 state[name] = value.copy() if copies else value
-        elif kind == "values" or kind == "arrays":
-            made, row = np.array(() if value is None else value, dtype=slot.of), slot.shapes[0]
+        elif kind == "values":
+            made, row = np.array(value, dtype=slot.of), slot.shapes[0]
             # Without a row, the array has the length of one all the same.
             state[name] = made.reshape(-1, row[1]) if len(row) == 2 and isinstance(row[1], int) else made
         elif kind == "named":
             below = f"{name}." if slot.name else prefix
             of = slot.of if slot.of in _NUMBERS else np.array
             state.update((below + key, of(one)) for key, one in value.items())
-        elif kind == "records":
-            for i, one in enumerate(value):
-                _save(one, f"{name}{i}.", state, copies)
         elif value is not None:
             _save(value, f"{name}." if slot.name else prefix, state, copies)
 
@@ -259,7 +337,8 @@ def _check(part: Any, values: dict[str, Any]) -> None:
             raise Refused.by_check(error) from error
     for slot in _slots(_type(part)):
         if slot.kind == "part":
-            _check(getattr(part, slot.field), values[slot.field])
+            with within(f"{slot.name}." if slot.name else ""):
+                _check(getattr(part, slot.field), values[slot.field])
 
 
 def _put(part: Any, values: dict[str, Any]) -> None:
@@ -267,6 +346,8 @@ def _put(part: Any, values: dict[str, Any]) -> None:
         value = values[slot.field]
         if slot.kind == "part":
             _put(getattr(part, slot.field), value)
+        elif isinstance(part, Numbers) and slot.kind == "array":
+            getattr(part, slot.field)[...] = value
         else:
             setattr(part, slot.field, deque(value, getattr(part, slot.field).maxlen) if slot.make is deque else value)
 
@@ -306,7 +387,7 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
             values[slot.field] = _number(of, _leaf(parts, name), slot.entry, name, sizes)
         elif slot.kind == "array" and slot.optional and name not in parts:
             values[slot.field] = None
-        elif slot.kind in ("array", "arrays", "values"):
+        elif slot.kind in ("array", "values"):
             values[slot.field] = _sequence(slot, _leaf(parts, name), sizes, bound)
         elif slot.kind == "named":
             given_names = slot.entry.among or tuple(key for key in parts.get(name, ()) if key)
@@ -314,13 +395,6 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
             with within(f"{name}." if name else ""):
                 values[slot.field] = {key: _one(slot, _leaf(below_parts, key), key) for key in given_names}
                 _no_more({} if not name else below_parts)
-        elif slot.kind == "records":
-            found: list[Any] = []
-            while f"{name}{len(found)}" in parts and len(found) < slot.entry.most:
-                found.append(_nested(slot, f"{name}{len(found)}", parts, sizes, below))
-            if len(found) < slot.least:
-                raise Refused(f"{name}{len(found)}", "nothing", "a record")
-            values[slot.field] = slot.make(found)
         elif not name:
             inner = _values(of, parts, sizes, below, bound)
             values[slot.field] = inner if slot.kind == "part" else _build(of, inner, below)
@@ -382,7 +456,7 @@ def _number(of: Any, value: Any, entry: Entry, name: str, sizes: Sizes = _NONE) 
 
 
 def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> Any:
-    """``value`` as the array, numbers or arrays that ``slot`` declares."""
+    """``value`` as the array or numbers that ``slot`` declares."""
     entry, name, dtype = slot.entry, slot.name, np.dtype(slot.of)
     if not isinstance(value, np.ndarray) or value.dtype != dtype or not _fits(slot, value.shape, sizes, bound):
         raise Refused(name, _words(value), f"an array of {dtype}, a shape of {_shapes(slot, sizes, bound)}")
@@ -398,10 +472,6 @@ def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> A
             raise Refused(name, f"elements from {wrong.min():g} to {wrong.max():g}", expected)
     if slot.kind == "array":
         return np.array(value, order="C")
-    if slot.kind == "arrays":
-        return slot.make(np.array(row) for row in value)
-    if slot.optional and not value.size:
-        return None
     return slot.make(value.tolist() if value.ndim == 1 else map(tuple, value.tolist()))
 
 
@@ -465,9 +535,9 @@ def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Ro
     """The entries that ``save`` writes of a record of ``cls``, in its order; without those of records in ``apart``."""
     for slot in _slots(cls):
         entry, name, inner = slot.entry, prefix + slot.name, prefix
-        if slot.kind in ("record", "part", "records"):
+        if slot.kind in ("record", "part"):
             if slot.name:
-                inner = f"{name}{'N' if slot.kind == 'records' else ''}."
+                inner = f"{name}."
                 yield Row(inner, "", "", "may be absent" if slot.optional else "", entry.meaning)
             if slot.of not in apart:
                 yield from rows(slot.of, inner, apart)

@@ -6,7 +6,8 @@ these cases. The file is continued where it ends, if the code of the learner and
 
 Variants
 --------
-rules : those of `RULES` are switched off, one at a time, each in a process forked from this one.
+rules : those of `RULES` are switched off, one at a time, each in a process forked from this one; those that are part of
+    the compiled order of a sample in a copy of the source, as constants are.
 fields (``--fields``) : half and twice each number of the learner's frozen configuration, integers rounded.
 constants (``--constants``) : likewise each number that a module of ``adaptive/online`` assigns, each in a copy of the
     source, since compiled code does not see a changed constant. A copy is compiled anew, which takes some two minutes
@@ -67,13 +68,10 @@ from benchmarks.foreign_motions import BAND
 from benchmarks.measured import RECORDS, Cut, data_folder, learnt
 from benchmarks.records import add_line, read_lines
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online import drift, gates, glitch_or_jump, intake, learner, sensor_trust
+from dehyst.adaptive.online import gates, glitch_or_jump, sensor_trust
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.drift import DriftConfig, RestCreep
-from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig
+from dehyst.adaptive.online.gates import LEARNT, PASSED, UNEXCITED, EnvelopeConfig, Judgement
 from dehyst.adaptive.online.intake import Intake
-from dehyst.adaptive.online.kernel_window import ResidualWindow
-from dehyst.adaptive.online.learner import Judgement
 from dehyst.adaptive.types import FloatArray, Sample
 from dehyst.lab.rehearsal import (
     SENSOR,
@@ -254,17 +252,36 @@ def _fits(name: str, seed: int, slow: bool) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
+class Text:
+    """A text that stands once in a module of ``adaptive/online``, and what replaces it."""
+
+    module: str
+    old: str
+    new: str
+
+    def replace_in(self, root: Path) -> None:
+        path = root / "adaptive" / "online" / f"{self.module}.py"
+        source = path.read_text()
+        if source.count(self.old) != 1:
+            raise ValueError(f"{path.name}: {self.old!r} stands there {source.count(self.old)} times, expected once")
+        path.write_text(source.replace(self.old, self.new))
+
+
+@dataclass(frozen=True, slots=True)
 class Rule:
-    """A rule that can be switched off: what is replaced (owner, name) and by what; for a property by its getter."""
+    """A rule that can be switched off: what is replaced (owner, name) and by what; for a property by its getter.
+
+    source : texts that are replaced where the rule is compiled.
+    """
 
     name: str
-    replaces: tuple[tuple[Any, str, Any], ...]
+    replaces: tuple[tuple[Any, str, Any], ...] = ()
+    source: tuple[Text, ...] = ()
 
     def switch_off(self) -> None:
         """In this process, for ever."""
         for owner, name, new in self.replaces:
-            old = vars(owner)[name]
-            mock.patch.object(owner, name, property(new) if isinstance(old, property) else new).start()
+            mock.patch.object(owner, name, new).start()
 
 
 def _always(value: Any) -> Callable[..., Any]:
@@ -282,67 +299,57 @@ def _begin_anew(self: Intake, sample: Sample, _hold: Any) -> Any:
     return self._restart(sample, gates.SETTLING)
 
 
-def _no_kernel(self: ResidualWindow) -> tuple[FloatArray, FloatArray, float]:
-    support, alpha, _ = _ARRAYS(self)
-    return support, np.zeros_like(alpha), 0.0
-
-
-_ARRAYS: Final = ResidualWindow.arrays
-_UPDATE: Final = drift.update
-
-
-def _ungated(c: DriftConfig, *rest: Any) -> str:
-    return _UPDATE(_without_gate(c), *rest)
-
-
-@functools.cache
-def _without_gate(c: DriftConfig) -> DriftConfig:
-    return replace(c, gate_sigma=1e9)
-
-
-def _of_fixed_noise(c: DriftConfig, *rest: Any) -> str:
-    return _UPDATE(_without_alike(c), *rest)
-
-
-@functools.cache
-def _without_alike(c: DriftConfig) -> DriftConfig:
-    return replace(c, alike_s=0.0)
-
-
-def _fixed_phase(now: int, every: int) -> bool:
-    return now % every == 0
-
-
-def _always_judges(self: Intake) -> bool:
-    return self._tells
-
-
+_CREDIT: Final = "if not (known and front.credit > 0):"
+_BEGINS: Final = "begins = front.until_control <= 0 and t.checks and f.tells"
+_JUDGES: Final = "return self._tells and self.credit > 0"
 RULES: Final = (
-    Rule("surprising readings are held", ((gates, "surprise", _always(math.inf)),)),
-    Rule("motion not yet learnt is not judged", ((intake, "is_known", _always(True)),)),
-    Rule("only a model with credit judges", ((Intake, "_judges", _always_judges), (Intake, "_check_model", _nothing))),
-    Rule("a model judges at all", ((Intake, "_judges", _always(False)), (Intake, "_check_model", _nothing))),
-    Rule("repeated readings are none", ((gates, "check_repeats", _always("")),)),
-    Rule("readings must follow the drive", ((Intake, "follow", _always(False)),)),
+    Rule("surprising readings are held", source=(
+        Text("gates", "return float(usual + KINK_SHARE * state.kink_V / span_V)", "return 1e300"),)),
+    Rule("motion not yet learnt is not judged", source=(
+        Text("intake", "return bool(abs(slope) <= BEYOND * known[0] and abs(bend) <= BEYOND * known[1])",
+             "return True"),)),
+    Rule("only a model with credit judges", source=(
+        Text("step", _CREDIT, "if not known:"), Text("step", _BEGINS, "begins = False"),
+        Text("intake", _JUDGES, "return self._tells"))),
+    Rule("a model judges at all", source=(
+        Text("step", _CREDIT, "if True:"), Text("step", _BEGINS, "begins = False"),
+        Text("intake", _JUDGES, "return False"))),
+    Rule("repeated readings are none", source=(
+        Text("gates", 'return GLITCH if state.same >= REPEATED and moved else ""', 'return ""'),)),
+    Rule("readings must follow the drive", source=(
+        Text("step", "if now % c.check_every != 0 or t.saturated or not f.tells:", "if True:"),)),
     Rule("undecided readings go on trial", ((Intake, "_give_up", _begin_anew),)),
     Rule("jumps move the frame", ((glitch_or_jump, "_is_jump", _always(False)),)),
-    Rule("memories after a gap", ((Intake, "_after_gap", _no_missing_motion),)),
-    Rule("rest: only the constant is learnt", ((Intake, "rests", _always(False)),)),
-    Rule("creep at rest moves the frame", ((RestCreep, "shift_um", _always(0.0)),)),
+    Rule("memories after a gap", ((Intake, "after_gap", _no_missing_motion),)),
+    Rule("rest: only the constant is learnt", source=(
+        Text("gates", "return (count - state.moved) * dt_s > config.rest_s", "return False"),)),
+    Rule("creep at rest moves the frame", source=(
+        Text("drift", "return -min(max(gained_um", "return 0.0 * min(max(gained_um"),)),
     Rule("envelope refuses frames", ((EnvelopeConfig, "refuses", _always("")),)),
-    Rule("fall back to the frozen model", ((Judgement, "choose", _always(False)),)),
-    Rule("roll back to a mark", ((learner, "ROLLBACK_S", math.inf),)),
-    Rule("validity", ((Judgement, "decide", _always(True)),)),
+    Rule("fall back to the frozen model", source=(
+        Text("gates", "if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:", "if False:"),)),
+    Rule("roll back to a mark", source=(
+        Text("step", "ROLLBACK_S, MARK_S, REFERENCE_S = 0.5,", "ROLLBACK_S, MARK_S, REFERENCE_S = 1e300,"),)),
+    Rule("validity", source=(Text("gates", "if self.valid and rms > leave_V:", "if False:"),)),
     Rule("doubt after a jump", ((Judgement, "add_doubt", _nothing),)),
-    Rule("a sudden change is detected", ((drift, "DEAD_S", math.inf),)),
-    Rule("a jump opens the filter", ((drift.DriftFilter, "expect_change", _nothing),)),
-    Rule("outliers are refused by the filter", ((drift, "update", _ungated),)),
-    Rule("the window learns", ((ResidualWindow, "learn", _always(LEARNT)),)),
-    Rule("the kernel part", ((ResidualWindow, "predict", _always(0.0)), (ResidualWindow, "arrays", _no_kernel))),
-    Rule("only the share that is borne out of the kernel part", ((ResidualWindow, "weigh", _nothing),)),
-    Rule("the noise follows from the innovations", ((drift, "update", _of_fixed_noise),)),
-    Rule("the window learns at moving phases", ((learner, "due", _fixed_phase),)),
-    Rule("smoother settles first", ((gates, "settling", _always(False)),)),
+    Rule("a sudden change is detected", source=(Text("drift", "DEAD_S = 0.25", "DEAD_S = 1e300"),)),
+    Rule("a jump opens the filter", source=(
+        Text("drift", "expect_change(self.config, self.state, self._x, self._P, self._burst)", "pass"),
+        Text("step", "expect_change(c.drift, r.filter.state, A.beta, A.covariance, A.bursts)", "pass"))),
+    Rule("outliers are refused by the filter", source=(Text("drift", "> c.gate_sigma**2 *", "> 1e18 *"),)),
+    Rule("the window learns", source=(
+        Text("step", "if window.due((track.count - 1 - c.lag) // c.filter_every, c.window_every):", "if False:"),)),
+    Rule("the kernel part", source=(
+        Text("step", '["kernel_V"] = steps.predict(W, A.point)', '["kernel_V"] = 0.0'),
+        Text("kernel_window", "share * self._window.alpha, share * self._window.bias",
+             "0.0 * self._window.alpha, 0.0"))),
+    Rule("only the share that is borne out of the kernel part", source=(
+        Text("step", "_weigh(r.share, t.kernel_V, left_V, c.step_s)", "pass"),)),
+    Rule("the noise follows from the innovations", source=(Text("drift", "c.alike_s / step_s * s.slow_V2", "0.0"),)),
+    Rule("the window learns at moving phases", source=(
+        Text("kernel_window", "return updates % every == (updates // every) % every", "return updates % every == 0"),)),
+    Rule("smoother settles first", source=(
+        Text("gates", "return state.since_start <= config.settle", "return False"),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
     Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
 )  # fmt: skip
@@ -377,7 +384,8 @@ class Variant:
     rule: Rule | None = None
     settings: Settings = field(default_factory=dict)
     value: str = ""
-    literal: Literal | None = None
+    #: What is replaced in a copy of the source, in which it runs then.
+    edits: tuple[Literal | Text, ...] = ()
 
 
 #: Names of the factors.
@@ -448,13 +456,13 @@ def constant_variants() -> list[Variant]:
         for name, factor in FACTORS.items():
             new = repr(scaled(number.value, factor))
             literal = Literal(path, number.lineno, number.col_offset, number.end_col_offset, new)
-            found.append(Variant(f"{label} {name}", label, value=repr(number.value), literal=literal))
+            found.append(Variant(f"{label} {name}", label, value=repr(number.value), edits=(literal,)))
     return found
 
 
 def rule_variants() -> list[Variant]:
     """Each rule switched off."""
-    return [Variant(rule.name, rule.name, rule) for rule in RULES]
+    return [Variant(rule.name, rule.name, rule, edits=rule.source) for rule in RULES]
 
 
 # --- Running.
@@ -480,17 +488,17 @@ def _work(cases: Sequence[Case], variant: Variant, noise: int, most_s: float, to
 
 
 def _work_in_copy(select: Sequence[str], variant: Variant, most_s: float, towards: Connection) -> None:
-    """Run the learner as it is in a copy of the source with another number; sends (name, numbers) at the end.
+    """Run the learner as it is in a copy of the source with what differs; sends (name, numbers) at the end.
 
     select : options of the command that choose the cases.
     """
-    assert variant.literal is not None
     with tempfile.TemporaryDirectory(prefix="ablation-") as name:
         root = Path(name)
         for folder in NEEDED:
             shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", root)
-        variant.literal.replace_in(root)
+        for edit in variant.edits:
+            edit.replace_in(root)
         results = root / "results.jsonl"
         command = [sys.executable, "-m", "benchmarks.ablation", "--bare", "--json", str(results), *select]
         limit = (int(most_s + COMPILE_S), int(most_s + COMPILE_S) + 5)
@@ -518,7 +526,7 @@ def run_all(
         while waiting and len(running) < jobs:
             variant, noise = waiting.pop(0)
             source, towards = context.Pipe(duplex=False)
-            if variant.literal:
+            if variant.edits:
                 process = context.Process(target=_work_in_copy, args=(select, variant, most_s, towards))
             else:
                 process = context.Process(target=_work, args=(cases, variant, noise, most_s, towards))

@@ -1,50 +1,84 @@
-"""A fleet: B independent learners as one batch, sample by sample the same as B single learners.
+"""A fleet: B learners as one batch, sample by sample the same as B single ones.
 
-Axes whose readings are ordinary are stepped together by compiled loops (`adaptive.fleet.step`), their windows by the
-processor or in torch. Readings that are far from the prediction, gaps, restarts, trials of a sensor, returns to the
-identified model and repairs of a window are rare. Such an axis is *apart*: from that sample on a single learner
-(``adaptive.online``) has its state and handles its samples, until it is ordinary again. So every rule of the single
-learner holds for each axis, and a refused axis costs the others nothing but the time of one single learner.
+The order of a sample is that of a single learner (`adaptive.online.step`), in a compiled loop over the axes. The rows
+of all axes are in common arrays. Where a sample needs what is rare, the axis' own `Learner` goes on with it, on the
+same row, so that a refused axis costs the others nothing but the time of one single learner. The windows are stepped on
+the processor, or all at once in torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import InputError, ModelFileError
-from dehyst.adaptive.fleet import step as steps
-from dehyst.adaptive.fleet.step import (
-    DOUBT,
-    NO_SAMPLE,
-    ODD,
-    OUTCOMES,
-    SAMPLE,
-    TEACHES,
-    CompiledWindows,
-    Fixed,
-    FleetState,
-    Rows,
-    Threads,
-    check_alike,
-    distinct,
-    fixed_of,
-)
 from dehyst.adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed, unpacked
 from dehyst.adaptive.online import gates
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.kernel_window import ResidualWindow
-from dehyst.adaptive.online.learner import Learner
-from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, Sample, StateDict, under
-from dehyst.adaptive.window.arrays import ACCEPTED, ALPHA, BETA, COUNT, GAMMA, ILL_CONDITIONED
+from dehyst.adaptive.online.gates import OUTCOMES
+from dehyst.adaptive.online.learner import NUMBERS, Home, Learner, allocate, config_record, row_in
+from dehyst.adaptive.online.row import row_of
+from dehyst.adaptive.online.step import DONE, ILL, JUDGE, PREDICT, TAKE, TRIED, WINDOW, go_on_all, memories_now
+from dehyst.adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict, under
+from dehyst.adaptive.window import arrays as ws
+from dehyst.adaptive.window.arrays import ACCEPTED, ALPHA, BETA, COUNT, GAMMA, ILL_CONDITIONED, WindowArrays
 
 if TYPE_CHECKING:
     from dehyst.adaptive.fleet.in_torch import TorchWindows
+
+#: In place of an outcome: no sample.
+NO_SAMPLE: Final = -1
+
+
+def distinct(bases: Sequence[LssvmInverse]) -> list[int]:
+    """(B,) number of the distinct model of each axis, frames aside, in the order of their first axes."""
+    found: dict[tuple[bytes, float], int] = {}
+    return [found.setdefault((base.packed[0][3:].tobytes(), base.span_V), len(found)) for base in bases]
+
+
+def check_alike(bases: Sequence[LssvmInverse]) -> None:
+    """Raise InputError naming the first axis whose model has another shape than that of axis 0."""
+    if not bases:
+        raise InputError("models: got none, expected one for each axis")
+    # Of the packed sizes all but the number of samples, the covariance and the bound.
+    shapes = [{"dt_s": base.dt_s, "shape": np.delete(base.packed[1], (5, 6, 9)).tolist()} for base in bases]
+    for i, shape in enumerate(shapes):
+        for name, got in shape.items():
+            if got != shapes[0][name]:
+                raise InputError(
+                    f"models[{i}].{name}: got {got}, expected {shapes[0][name]} as of axis 0; identify all alike"
+                )
+
+
+# --- Threads that share the axes. Each axis is stepped by one of them, so the result does not depend on their number.
+
+
+#: Fewest axes for which a second thread is worth its wake-up.
+_LEAST_AXES = 16
+
+
+class Threads:
+    """Some threads that share a loop over axes; for several callers at once."""
+
+    def __init__(self, count: int) -> None:
+        self._pool = ThreadPoolExecutor(count - 1, "fleet") if count > 1 else None
+        self._count = count
+
+    def share(self, count: int, work: Callable[..., None], *arguments: object) -> None:
+        """``work(lo, hi, ...)`` over ``count`` axes, in parts on the threads."""
+        parts = max(1, min(self._count, count // _LEAST_AXES))
+        ends = [count * i // parts for i in range(parts + 1)]
+        pool = self._pool
+        others = [pool.submit(work, ends[i], ends[i + 1], *arguments) for i in range(1, parts)] if pool else []
+        work(0, ends[1], *arguments)
+        for one in others:
+            one.result()
+
 
 # --- Snapshots: the served models of all axes, immutable, and their evaluation at once.
 
@@ -102,60 +136,68 @@ class FleetSnapshot:
 
 @compiled
 def _pack(
-    lo: int, hi: int, s: Rows, c: Fixed, V: FloatArray, F: FloatArray, C: IntArray, support: FloatArray,
+    lo: int, hi: int, rows: IntArray, numbers: Any, V: FloatArray, F: FloatArray, C: IntArray, support: FloatArray,
     widths: FloatArray, margin: float, packed: FloatArray, counts: IntArray, linear: FloatArray,
 ) -> None:  # fmt: skip
     """The learnt models of all axes in the layout of `LssvmInverse.packed`, with ``linear`` as of `FleetSnapshot`."""
     for b in range(lo, hi):
-        out, r, f, n = packed[b], s.numbers[b], c.axis[b], C[b, COUNT]
-        j, span, bounded = r.judgement, s.domain[b, 1::2] - s.domain[b, ::2], f.allowed_V > 0.0
-        counts[b] = c.sizes[f.model]
+        A, out, r, n = row_of(rows[b]), packed[b], numbers[b], C[b, COUNT]
+        j, span, bounded = r.judgement, A.domain[1::2] - A.domain[::2], r.fixed.allowed_V > 0.0
+        counts[b] = A.sizes
         counts[b, 5], counts[b, 6], counts[b, 9] = n, 0, bounded
+        known, anchor, _, _, _, _ = unpacked(A.model, A.sizes)
         m, beta, inverse_widths, alpha, scaled, at = unpacked(out, counts[b])
-        m.frame[:], m.scale[:] = s.frames[b], c.features.scale[b]
-        m.thresholds[:], m.arcs[:], m.retain[:] = c.features.thresholds[b], c.features.arcs[b], c.features.retain[b]
+        m.frame[:], m.scale[:] = A.frames[1, :3], known.scale
+        m.thresholds[:], m.arcs[:], m.retain[:] = known.thresholds, known.arcs, known.retain
         out[3] = max(j.long_V2, j.short_V2) + j.doubt_V2
-        out[4], out[5], out[6] = r.window.kernel_variance, 1.0 / (1.0 + 1.0 / F[b, GAMMA]), f.allowed_V
-        out[7:13:2] = s.domain[b, ::2] - margin * span
-        out[8:13:2] = s.domain[b, 1::2] + margin * span
-        share = r.window.share
-        beta[:], inverse_widths[:], alpha[:] = s.beta[b], widths[b], share * V[b, ALPHA, :n]
+        out[4], out[5], out[6] = r.share.kernel_variance, 1.0 / (1.0 + 1.0 / F[b, GAMMA]), r.fixed.allowed_V
+        out[7:13:2] = A.domain[::2] - margin * span
+        out[8:13:2] = A.domain[1::2] + margin * span
+        share = r.share.share
+        beta[:], inverse_widths[:], alpha[:] = A.beta, widths[b], share * V[b, ALPHA, :n]
         beta[0] += share * F[b, BETA]
         scaled[:] = support[b, :, :n]
         if bounded:
-            out[at : at + beta.size] = c.beta[b]
-        linear[b, 0], linear[b, 1], linear[b, 2:] = r.front.track.served.gain, s.frames[b, 0], beta
+            out[at : at + beta.size] = anchor
+        linear[b, 0], linear[b, 1], linear[b, 2:] = A.frames[1, 3], A.frames[1, 0], beta
 
 
-def snapshot_of(
-    bases: tuple[LssvmInverse, ...], s: Rows, c: Fixed, windows: dict[str, FloatArray], apart: dict[int, LssvmInverse],
-    threads: Threads,
-) -> FleetSnapshot:  # fmt: skip
-    """Copies of what is served now; ``apart`` : models of the axes that are not in the batch, or frozen."""
-    B, p = s.beta.shape
-    d, most = windows["scaled"].shape[1:]
-    length = max(17 + int(c.sizes[0, :3].sum()) + 2 * p + d + (1 + d) * most, c.models.shape[1])
-    packed, counts = np.empty((B, length)), np.empty((B, c.sizes.shape[1]), dtype=np.int64)
-    linear, parts = np.empty((B, 2 + p)), (windows[name] for name in ("V", "F", "C", "scaled", "inverse_widths"))
-    threads.share(B, _pack, s, c, *parts, DOMAIN_MARGIN, packed, counts, linear)
-    seq, valid = s.numbers["front"]["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
-    fallen = [axis for axis in np.flatnonzero(s.numbers["judgement"]["fallback"]).tolist() if axis not in apart]
-    for axis, model in (apart | {axis: bases[axis] for axis in fallen}).items():
-        row, sizes = model.packed
-        packed[axis, : row.size], counts[axis] = row, sizes
-        linear[axis] = model.features.gain, model.features.offset_um, *model.beta
-    # The fourth number of a packed model is the variance of its noise.
-    packed[fallen, 3] = s.numbers["judgement"]["frozen_short_V2"][fallen]
-    for axis, model in apart.items():
-        seq[axis], valid[axis] = model.seq, model.valid
-    return FleetSnapshot(bases, seq, valid, linear, packed, counts, threads)
+# --- The windows of all axes on the processor: the single learner's own compiled steps.
+
+
+class CompiledWindows:
+    """Windows of B axes, stepped by compiled code."""
+
+    #: Whether ``arrays`` gives the state itself, not a copy.
+    shares = True
+
+    def __init__(self, starts: Sequence[WindowArrays]) -> None:
+        """``starts`` : what each window begins as."""
+        names = [name for name in WindowArrays._fields if name != "kept"]
+        self._all = {name: np.array([getattr(start, name) for start in starts]) for name in names}
+        # It takes memory as it is written: in the inverse form, never.
+        self._all["kept"] = np.zeros((len(starts), starts[0].kept.size))
+        self._views = [
+            WindowArrays(**{name: field[axis] for name, field in self._all.items()}) for axis in range(len(starts))
+        ]
+        for view in self._views:
+            ws.forget_kept(view)
+        self.handles = np.array([ws.handle_of(view) for view in self._views])
+
+    def arrays(self, axis: int) -> WindowArrays:
+        """The solver's state of an axis: views, stepped in place by whoever has them."""
+        return self._views[axis]
+
+    def put(self, axis: int, arrays: WindowArrays) -> None:
+        """Take over the state of a solver."""
+        ws.take_over(self._views[axis], arrays)
+
+    def samples(self) -> dict[str, FloatArray]:
+        """The windows' arrays by name; views."""
+        return self._all
 
 
 # --- The fleet.
-
-
-#: Samples within which the matrices of all windows are written.
-WRITTEN_WITHIN = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +233,7 @@ class Fleet:
 
     Attributes
     ----------
-    axes : B. bases : (B,) identified models. apart : the axes that are not ordinary at present, as single learners.
-    held : what frozen axes serve.
+    axes : B. bases : (B,) identified models. held : what frozen axes serve.
     """
 
     def __init__(self, models: Sequence[LssvmInverse], config: FleetConfig | None = None) -> None:
@@ -200,28 +241,26 @@ class Fleet:
         self.config = config = config or FleetConfig()
         self.bases = tuple(models)
         check_alike(models)
-        numbers = distinct(models)
-        made = [Learner(models[numbers.index(i)], config.learner) for i in range(max(numbers) + 1)]
-        templates = [made[number] for number in numbers]
-        self._c = c = fixed_of(models, config.learner, templates)
-        self._state = FleetState(models, config.learner, templates[0].parts.delay.steps)
-        self._threads = Threads(config.threads)
-        self.axes = len(models)
-        self._samples = np.zeros(self.axes, SAMPLE)
-        arrays = [template.parts.window.window_arrays for template in templates]
+        numbers, c = distinct(models), config.learner
+        made = [Learner(models[numbers.index(i)], c) for i in range(max(numbers) + 1)]
+        starts = [made[number].parts.window.window_arrays for number in numbers]
+        self.axes, self._threads = len(models), Threads(config.threads)
+        self._numbers, self._config = np.zeros(self.axes, NUMBERS), config_record(c, models[0].dt_s)
+        self._arrays = allocate(self.axes, models[0], c)
         if config.device == "cpu":
-            self._windows: CompiledWindows | TorchWindows = CompiledWindows(self._state.rows, c, arrays, self._threads)
+            self._windows: CompiledWindows | TorchWindows = CompiledWindows(starts)
         else:
             from dehyst.adaptive.fleet.in_torch import TorchWindows
 
-            self._windows = TorchWindows(self._state.rows, c, arrays, config.device)
-        self.apart: dict[int, Learner] = {}
-        self._shells: dict[int, Learner] = {}
+            self._windows = TorchWindows(starts, self._arrays, self._numbers, c.eviction == "fifo", config.device)
+        self._learners = []
+        for b, base in enumerate(models):
+            window = self._windows.arrays(b) if self._windows.shares else starts[b]
+            home = Home(self._numbers[b : b + 1], self._config, row_in(self._arrays, b, base, c), window)
+            self._learners.append(Learner(base, c, home))
+        self._rows = np.array([learner.parts.handle for learner in self._learners])
         self.held: dict[int, LssvmInverse] = {}
         self._cache: FleetSnapshot | None = None
-        for i in range(self.axes):
-            # Before its first sample an axis has no place: the single learner takes that one.
-            self._set_apart(i, self._learner(i))
 
     def step(self, seq: object, t_s: object, u_V: object, y_um: object, present: object = True) -> IntArray:
         """Take one sample of each axis that is ``present``; arguments are (B,) or one value for all.
@@ -229,112 +268,69 @@ class Fleet:
         Returns (B,) results: the number of the outcome in ``OUTCOMES``, NO_SAMPLE for an axis that is not present.
         Never raises on the values of samples; raises InputError on shapes.
         """
-        w = self._samples
+        w = self._numbers["sample"]
         for name, given in (("seq", seq), ("t_s", t_s), ("u_V", u_V), ("y_um", y_um), ("present", present)):
             values = np.asarray(given)
             if values.shape not in ((), (self.axes,)):
                 raise InputError(f"{name}: got shape {values.shape}, expected ({self.axes},) or one value for all")
             w[name] = values
-        outcome = w["outcome"]
-        outcome[:] = NO_SAMPLE
-        apart, together = [axis for axis in self.apart if w["present"][axis]], w["present"].copy()
-        together[list(self.apart)] = False
-        inside = np.flatnonzero(together)
-        if inside.size:
-            self._step_together(inside)
-            doubtful = np.flatnonzero(outcome == DOUBT).tolist()
-            for axis in doubtful:
-                self._take_out(axis)
-            apart += doubtful
-        for axis in apart:
-            learner = self.apart[axis]
-            if not learner.parts.intake.begins:
-                self._windows.write([axis])
-            self._settle(axis, learner, learner.handle(Sample(*w[axis].item()[:4])))
-        self._windows.write(list(islice(self._windows.unwritten, -(-self.axes // WRITTEN_WITHIN))))
-        return outcome.copy()
+        w["due"] = False
+        axes = np.flatnonzero(w["present"])
+        if axes.size:
+            self._let_check(axes)
+            rare = self._through(axes, TAKE)
+            if rare or w["due"].any():
+                self._cache = None
+        return np.where(w["present"], w["outcome"], NO_SAMPLE)
 
     def warm(self) -> None:
         """Load or compile every step, so that no sample waits for the compiler."""
-        s, c, w, share, none = self._state.rows, self._c, self._samples, self._threads.share, np.arange(0)
-        share(0, steps.take, none, s, c, w)
-        share(0, steps.teach, none, self._windows.predict(none), s, c, w)
-        self._windows.learn(none, w)
+        self._through(np.arange(0), TAKE)
         still = np.zeros((self.axes, 1))
         self.snapshot().feedforward(still, still, still, self.memory())
 
-    def _let_check(self, inside: IntArray) -> None:
+    def _let_check(self, axes: IntArray) -> None:
         """Note whose control trial may begin: as many as the configuration allows, the longest waiting first."""
-        waits = self._state.rows.numbers["front"]["until_control"]
-        due = inside[waits[inside] <= 1]
-        room = self.config.checks - sum(one.parts.intake.controls for one in self.apart.values())
-        self._samples["controls"] = False
-        self._samples["controls"][due[waits[due].argsort(kind="stable")[: max(room, 0)]]] = True
+        waits, checks = self._numbers["intake"]["until_control"], self._numbers["sample"]["checks"]
+        due = axes[waits[axes] <= 1]
+        room = self.config.checks - int(self._numbers["intake"]["control"].sum())
+        checks[:] = False
+        checks[due[waits[due].argsort(kind="stable")[: max(room, 0)]]] = True
 
-    def _step_together(self, inside: IntArray) -> None:
-        s, c, w, share = self._state.rows, self._c, self._samples, self._threads.share
-        outcome = w["outcome"]
-        self._let_check(inside)
-        share(inside.size, steps.take, inside, s, c, w)
-        axes = inside[outcome[inside] == TEACHES]
-        failed = axes[:0]
-        if axes.size:
-            share(axes.size, steps.teach, axes, self._windows.predict(axes), s, c, w)
-            learning = axes[w["learns"][axes]]
-            if learning.size:
-                status = self._windows.learn(learning, w)
+    def _through(self, axes: IntArray, stage: int) -> bool:
+        """The samples of ``axes`` from ``stage`` on to their end. Returns whether one needed what is rare."""
+        w, windows, share = self._numbers["sample"], self._windows, self._threads.share
+        handles, here = windows.handles, windows.shares
+        share(axes.size, go_on_all, axes, self._rows, handles, self._numbers, self._config, stage, here)
+        at = w["stage"][axes]
+        rare = axes[at >= TRIED].tolist()
+        if not isinstance(windows, CompiledWindows):
+            predicts, learns = axes[at == PREDICT], axes[at == WINDOW]
+            if predicts.size:
+                w["kernel_V"][predicts] = windows.predict(predicts)
+                rare += [-1] * self._through(predicts, JUDGE)
+            if learns.size:
+                status = windows.learn(learns, self._rows, self._config)
                 learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)
-                outcome[learning] = np.where(status == ACCEPTED, learnt, refused)
-                failed = learning[status == ILL_CONDITIONED]
-            self._cache = None
-        counted = inside[outcome[inside] >= 0]
-        s.counters[counted, outcome[counted]] += 1
-        for axis in axes[outcome[axes] == ODD].tolist():
-            learner = self._take_out(axis)
-            track = learner.parts.intake.track
-            pair = track.pair() if track is not None else None
-            assert pair is not None
-            said = learner.teach(pair)
-            learner.parts.counters[said] += 1
-            self._settle(axis, learner, said)
-        for axis in failed.tolist():
-            self._take_out(axis).parts.window.begin_healing()
+                w["outcome"][learns] = np.where(status == ACCEPTED, learnt, refused)
+                w["stage"][learns] = np.where(status == ILL_CONDITIONED, ILL, DONE)
+                rare += learns[status == ILL_CONDITIONED].tolist()
+                done = learns[status != ILL_CONDITIONED]
+                self._arrays["counters"][done, w["outcome"][done]] += 1
+        for axis in rare:
+            if axis >= 0:
+                self.learner_of(axis).go_on(int(w["stage"][axis]))
+                self._take_window(axis)
+        return bool(rare)
 
-    # ---- in and out of the batch
-
-    def _learner(self, axis: int) -> Learner:
-        """The single learner of an axis, over the axis' own window."""
-        if axis not in self._shells or not self._windows.shares:
-            base, c = self.bases[axis], self.config.learner
-            window = ResidualWindow.over(self._windows.arrays(axis), base, c.eviction, c.solver)
-            self._shells[axis] = Learner.around(base, c, window, float(self._c.axis["allowed_V"][axis]))
-        return self._shells[axis]
-
-    def _set_apart(self, axis: int, learner: Learner) -> Learner:
-        self.apart[axis] = learner
-        self._note(axis, learner)
-        return learner
-
-    def _take_out(self, axis: int) -> Learner:
-        return self._set_apart(axis, self.learner_of(axis))
-
-    def _settle(self, axis: int, learner: Learner, outcome: str) -> None:
-        """Note what a single learner said to a sample, and take it back into the batch where it is ordinary."""
-        self._samples["outcome"][axis] = OUTCOMES.index(outcome)
-        self._note(axis, learner)
-        if learner.parts.ordinary:
-            del self.apart[axis]
-            arrays = learner.parts.window.window_arrays
-            self._windows.put(axis, arrays)
-            if arrays is not self._windows.arrays(axis):
-                del self._shells[axis]
-            self._state.load(axis, learner.parts.state_dict(arrays=False) | {"frozen": learner.frozen})
-
-    def _note(self, axis: int, learner: Learner) -> None:
-        """Note the figures of an axis that is apart, for reports on all."""
-        self._cache = None
-        self._state.rows.counters[axis] = [learner.parts.counters[name] for name in OUTCOMES]
-        self._state.rows.numbers["judgement"]["short_V2"][axis] = learner.parts.judgement.short_V2
+    def _take_window(self, axis: int) -> None:
+        """Take over the window of an axis where its learner has stepped or replaced it."""
+        window, windows = self._learners[axis].parts.window, self._windows
+        if not windows.shares:
+            windows.put(axis, window.window_arrays)
+        elif window.window_arrays is not windows.arrays(axis):
+            windows.put(axis, window.window_arrays)
+            window.take_arrays(windows.arrays(axis))
 
     def load_axis(self, axis: int, state: StateDict, anew: bool = False) -> None:
         """Continue an axis from the state of a single learner of the same model and configuration.
@@ -346,17 +342,14 @@ class Fleet:
         # First, because the settings of a damaged state may ask for any memory.
         if under("config.", state) != self.config.learner.state_dict():
             raise ModelFileError(f"axis {axis}: the state is of another configuration of the learner")
-        given, base = Learner.from_state(state), self.bases[axis]
-        if given.base.features != base.features or not np.array_equal(given.base.beta, base.beta):
+        given, base = LssvmInverse.from_state(under("base.", state)), self.bases[axis]
+        if given.features != base.features or not np.array_equal(given.beta, base.beta):
             raise ModelFileError(f"axis {axis}: the state is of another model; load the one of this axis")
-        self._shells.pop(axis, None)
-        self._windows.put(axis, given.parts.window.window_arrays)
-        learner = self._learner(axis)
-        learner.resume(state, arrays=False)
+        learner = self._learners[axis]
+        learner.resume(state)
+        self._take_window(axis)
         if anew:
             learner.resync()
-        # Its next sample shows whether it is ordinary.
-        self._set_apart(axis, learner)
         self.held.pop(axis, None)
         self.freeze([axis], learner.frozen)
 
@@ -368,7 +361,6 @@ class Fleet:
         for axis in axes:
             learner = self.learner_of(axis)
             (learner.freeze if frozen else learner.thaw)()
-            self._state.rows.numbers["frozen"][axis] = frozen
             if frozen:
                 self.held.setdefault(axis, learner.snapshot())
             else:
@@ -384,44 +376,72 @@ class Fleet:
     def snapshot(self) -> FleetSnapshot:
         """The models of all axes as they stand, immutable; the same object while nothing was learnt."""
         if self._cache is None:
-            models = {axis: learner.snapshot() for axis, learner in self.apart.items()} | self.held
-            rows, samples = self._state.rows, self._windows.samples()
-            self._cache = snapshot_of(self.bases, rows, self._c, samples, models, self._threads)
+            self._cache = self._pack()
         return self._cache
+
+    def _pack(self) -> FleetSnapshot:
+        n, windows, p = self._numbers, self._windows.samples(), self._arrays["beta"].shape[1]
+        sizes, (d, most) = np.array([base.packed[1] for base in self.bases]), windows["scaled"].shape[1:]
+        length = max(17 + int(sizes[0, :3].sum()) + 2 * p + d + (1 + d) * most, *(b.packed[0].size for b in self.bases))
+        packed, counts = np.empty((self.axes, length)), np.empty(sizes.shape, dtype=np.int64)
+        linear, parts = np.empty((self.axes, 2 + p)), (windows[i] for i in ("V", "F", "C", "scaled", "inverse_widths"))
+        self._threads.share(self.axes, _pack, self._rows, n, *parts, DOMAIN_MARGIN, packed, counts, linear)
+        seq, valid = n["intake"]["gates"]["seq"].copy(), n["judgement"]["valid"].copy()
+        # Where a gap or a fault is open, or the identified model is served, the model is made one by one.
+        alone = n["intake"]["trial"] | n["intake"]["missing"] | n["judgement"]["fallback"]
+        one_by_one = {axis: self.learner_of(axis).snapshot() for axis in np.flatnonzero(alone).tolist()}
+        for axis, model in (one_by_one | self.held).items():
+            row, of = model.packed
+            packed[axis, : row.size], counts[axis] = row, of
+            linear[axis] = model.features.gain, model.features.offset_um, *model.beta
+            seq[axis], valid[axis] = model.seq, model.valid
+        return FleetSnapshot(self.bases, seq, valid, linear, packed, counts, self._threads)
 
     def memory(self) -> FloatArray:
         """(B, m) hysteresis memory with which each axis' served model goes on from its last sample."""
-        s, identified = self._state.rows, self._state.rows.numbers["judgement"]["fallback"].copy()
+        n, identified = self._numbers, self._numbers["judgement"]["fallback"].copy()
         for axis, model in self.held.items():
-            moved = not np.array_equal(s.frames[axis], model.features.arrays.frame)
+            moved = not np.array_equal(self._arrays["frames"][axis, 1, :3], model.features.arrays.frame)
             identified[axis] = moved and model.features == self.bases[axis].features
-        out = np.empty_like(s.memory)
-        steps.memory_now(s, self._c, identified, out)
-        for axis, learner in self.apart.items():
-            kept = learner.memory_for(self.held.get(axis) or learner.snapshot())
+        out: FloatArray = np.empty_like(self._arrays["memory"])
+        memories_now(self._rows, n, identified, out)
+        alone = n["intake"]["hold"] | n["intake"]["trial"] | ~n["intake"]["track"]["begun"]
+        for axis in np.flatnonzero(alone).tolist():
+            learner = self._learners[axis]
+            kept = learner.memory_for(self.model_of(axis))
             out[axis] = learner.memory() if kept is None else kept
         return out
 
     # ---- reports
 
+    @property
+    def apart(self) -> set[int]:
+        """Axes with something rare under way, in which their samples need more than the compiled order."""
+        front = self._numbers["intake"]
+        rare = front["lost"] | ~front["track"]["begun"] | self._numbers["sample"]["heals"]
+        for name in ("hold", "trial", "control", "missing", "proven", "proven_past"):
+            rare = rare | front[name]
+        return set(np.flatnonzero(rare).tolist())
+
     def learner_of(self, axis: int) -> Learner:
-        """An axis as a single learner, to look into: its own where it is apart, else a copy."""
-        self._windows.write([axis])
-        if axis in self.apart:
-            return self.apart[axis]
-        learner = self._learner(axis)
-        learner.resume(self._state.read(axis), arrays=False)
+        """The learner of an axis, to look into."""
+        learner = self._learners[axis]
+        learner.look_again()
+        if not self._windows.shares:
+            learner.parts.window.take_arrays(self._windows.arrays(axis))
         return learner
 
     def outcomes(self) -> IntArray:
         """(B, outcomes) samples by outcome, in the order of ``OUTCOMES``."""
-        return self._state.rows.counters.copy()
+        counters: IntArray = self._arrays["counters"].copy()
+        return counters
 
     def rms_error_pct(self) -> FloatArray:
         """(B,) rms error of the last 0.1 s, percent of the voltage span."""
-        mean_V2 = self._state.rows.numbers["judgement"]["short_V2"]
-        return np.asarray(100.0 * np.sqrt(mean_V2) / self._c.axis["span_V"], dtype=np.float64)
+        mean_V2 = self._numbers["judgement"]["short_V2"]
+        return np.asarray(100.0 * np.sqrt(mean_V2) / self._numbers["fixed"]["span_V"], dtype=np.float64)
 
     def troubles(self) -> dict[int, str]:
-        """Names of what keeps axes from learning, by axis; see `Learner.trouble`. Such an axis is apart."""
-        return {axis: one.trouble for axis, one in sorted(self.apart.items()) if one.trouble}
+        """Names of what keeps axes from learning, by axis; see `Learner.trouble`."""
+        tried = np.flatnonzero(self._numbers["intake"]["trial"]).tolist()
+        return {axis: name for axis in tried if (name := self._learners[axis].trouble)}

@@ -8,30 +8,30 @@ because batched products do not use a triangle; the update is symmetric to the l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dehyst.adaptive.fleet import step
-from dehyst.adaptive.fleet.step import Fixed, Rows
 from dehyst.adaptive.online.kernel_window import SAME
+from dehyst.adaptive.online.step import learn_all
 from dehyst.adaptive.types import FloatArray, IntArray
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window.arrays import ACCEPTED, WindowArrays
 
 
 class TorchWindows:
-    """Windows of B axes. See `adaptive.fleet.step.CompiledWindows`."""
+    """Windows of B axes. See `adaptive.fleet.fleet.CompiledWindows`."""
 
     shares = False
-    #: All matrices are written from the start; see `CompiledWindows.unwritten`.
-    unwritten: Final[dict[int, WindowArrays]] = {}
 
-    def __init__(self, rows: Rows, fixed: Fixed, starts: Sequence[WindowArrays], device: str) -> None:
-        self._rows, self._fixed, self._device = rows, fixed, torch.device(device)
+    def __init__(
+        self, starts: Sequence[WindowArrays], rows: Mapping[str, Any], numbers: Any, fifo: bool, device: str
+    ) -> None:
+        """``starts`` : what each window begins as. ``rows``, ``numbers`` : arrays and numbers of all axes."""
+        self._rows, self._numbers, self._fifo, self._device = rows, numbers, fifo, torch.device(device)
         B, example = len(starts), starts[0]
         self._all = {
             name: torch.zeros((B, *field.shape), dtype=torch.as_tensor(field).dtype, device=self._device)
@@ -39,12 +39,9 @@ class TorchWindows:
             if name != "kept"  # which the inverse form does not have
         }
         self._slots = torch.arange(example.S.size, device=self._device)
-        self._handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
+        self.handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
         for start in {id(start): start for start in starts}.values():
             self.put([axis for axis, other in enumerate(starts) if other is start], start)
-
-    def write(self, axes: Iterable[int]) -> None:
-        """Nothing: the matrices are written."""
 
     def _to(self, array: Any) -> Tensor:
         return torch.as_tensor(array).to(self._device)
@@ -79,40 +76,36 @@ class TorchWindows:
     def predict(self, axes: IntArray) -> FloatArray:
         """(k,) kernel parts, V, at the present points of ``axes``."""
         at = self._to(axes)
-        column = self._column(at, self._to(self._rows.point[axes]))
+        column = self._column(at, self._to(self._rows["point"][axes]))
         return np.asarray(((column * self._all["V"][at, ws.ALPHA]).sum(1) + self._all["F"][at, ws.BETA]).cpu())
 
-    def learn(self, axes: IntArray, w: Any) -> IntArray:
-        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn`."""
-        s, at, turns, config = self._rows, self._to(axes), self._rows.numbers["window"], self._fixed.config[0]
-        points = self._to(s.point[axes])
+    def learn(self, axes: IntArray, rows: IntArray, config: Any) -> IntArray:
+        """(k,) status of one step of each window; ``rows`` : handles. See `ResidualWindow.learn`."""
+        at, turns, born = self._to(axes), self._numbers["share"], self._rows["born"]
+        points = self._to(self._rows["point"][axes])
         column, count = self._column(at, points), self._all["C"][at, ws.COUNT]
         value, nearest = torch.where(self._slots < count[:, None], column, -1.0).max(1)
         room = (count < self._slots.numel()) & (value < SAME)
-        if config["fifo"]:
-            held = np.arange(s.born.shape[1]) < count.cpu().numpy()[:, None]
-            nearest = self._to(np.where(held, s.born[axes], np.iinfo(np.int64).max).argmin(1))
+        if self._fifo:
+            held = np.arange(born.shape[1]) < count.cpu().numpy()[:, None]
+            nearest = self._to(np.where(held, born[axes], np.iinfo(np.int64).max).argmin(1))
         slots = torch.where(room, count, nearest)
-        targets = self._to(w["target_V"][axes])
+        targets = self._to(self._numbers["sample"]["target_V"][axes])
         good = self._exchange(at, slots, points, targets, column)
         status = np.full(axes.size, ACCEPTED)
         done, slot = axes[good], slots.cpu().numpy()[good]
         turns["clock"][done] += 1
-        s.born[done, slot] = turns["clock"][done]
-        rest = ~good
-        said = np.empty(int(rest.sum()), dtype=np.int64)
-        self._alone(axes[rest], step.learn, w, said)
-        status[rest] = said
-        return status
-
-    def _alone(self, axes: IntArray, work: Callable[..., None], *arguments: object) -> None:
-        """Steps of some axes by the processor's compiled code, on copies that are taken over."""
-        copies = {axis: self.arrays(axis) for axis in axes.tolist()}
+        born[done, slot] = turns["clock"][done]
+        # The others by the processor's compiled code, on copies that are taken over.
+        rest, said = axes[~good], np.empty(int((~good).sum()), dtype=np.int64)
+        copies = {axis: self.arrays(axis) for axis in rest.tolist()}
         for axis, arrays in copies.items():
-            self._handles[axis] = ws.handle_of(arrays)
-        work(0, axes.size, self._handles, axes, self._rows, self._fixed, *arguments)
+            self.handles[axis] = ws.handle_of(arrays)
+        learn_all(rest, rows, self.handles, self._numbers, config, said)
         for axis, arrays in copies.items():
             self.put(axis, arrays)
+        status[~good] = said
+        return status
 
     def _exchange(self, axes: Tensor, slot: Tensor, x: Tensor, y: Tensor, column: Tensor) -> Any:
         """A sample into ``slot`` of each axis, for the one there or as one more: `steps.replace` and ``append``.
@@ -123,7 +116,7 @@ class TorchWindows:
             return np.zeros(0, dtype=np.bool_)
         A, k = self._all, torch.arange(axes.numel(), device=axes.device)
         # All axes are stepped in place; of some, copies are.
-        whole = axes.numel() == self._rows.x.shape[0]
+        whole = axes.numel() == self._numbers.size
         P = A["P"] if whole else A["P"][axes]
         C, F, V = A["C"][axes], A["F"][axes], A["V"][axes]
         gamma, count = F[:, ws.GAMMA], C[:, ws.COUNT]

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan, nan
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled, shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers, record_of
 from dehyst.adaptive.types import FloatArray
 
 # --- The drift filter's algebra, compiled: one scalar measurement of a random walk, in O(p²).
@@ -182,8 +182,7 @@ class DriftConfig:
             raise InputError(f"drift.noise: got {self.noise}, expected a positive share of the voltage span")
 
 
-@dataclass(slots=True)
-class DriftState:
+class DriftState(Numbers):
     """Counters of the filter, and the innovations by which it detects changes."""
 
     fast_V2: Annotated[float, Entry("short-term mean square innovation", "V²", low=0.0)] = 0.0
@@ -209,7 +208,7 @@ DEAD_S = 0.25
 
 
 @shared
-def _expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, bursts: FloatArray) -> None:
+def expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, bursts: FloatArray) -> None:
     """See `DriftFilter.expect_change`; ``bursts`` (p,) V²."""
     walk(x, P, bursts, c.burst_gain**2)
     s.quiet = 0
@@ -221,9 +220,16 @@ def update(
     c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, walks: FloatArray, bursts: FloatArray, span_V: float,
     step_s: float, basis: FloatArray, target_V: float, moving: bool, k: FloatArray, row: FloatArray,
 ) -> str:  # fmt: skip
-    """See `DriftFilter.update`. ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V².
+    """Update with one measurement ``target_V`` of ``basis' x``; ``basis`` (p,).
 
-    x (p,), P (p, p) change in place; k, row (p,) are scratch.
+    Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
+
+    At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the same
+    basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at one
+    position would change the model at all others, and would give too much weight to the next motion's first samples.
+
+    ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V². x (p,), P (p, p) change in place;
+    k, row (p,) are scratch.
     """
     if moving:
         innovation, variance = _walk_and_innovation(x, P, walks, c.gain_walk**2 * step_s, basis, target_V, row)
@@ -241,7 +247,7 @@ def update(
     outcome = "updated"
     threshold = max(c.burst_ratio * s.slow_V2, (c.burst_floor * span_V) ** 2)
     if s.fast_V2 > threshold and s.quiet * step_s > DEAD_S and moving:
-        _expect_change(c, s, x, P, bursts)
+        expect_change(c, s, x, P, bursts)
         outcome = "burst"
     # Limited, so that a change does not raise the long-term level and hide the next change.
     s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, step_s / SLOW_S)
@@ -256,7 +262,7 @@ def update(
     return outcome
 
 
-class DriftFilter:
+class DriftFilter(Numbers):
     """Random-walk Kalman filter on ``beta`` (p,), in V per normalised input.
 
     Parameters
@@ -264,6 +270,7 @@ class DriftFilter:
     config : frozen configuration.
     beta : (p,) initial estimate, and covariance : (p, p) its covariance, V².
     step_s : time between two updates, s. span_V : the model's voltage span, V.
+    record, arrays : where its numbers and its two arrays are kept; of its own unless given.
     """
 
     _x: Annotated[FloatArray, Entry("linear part", "V", "p", name="beta")]
@@ -271,7 +278,14 @@ class DriftFilter:
     state: Annotated[DriftState, Entry("counters of the filter", name="")]
 
     def __init__(
-        self, config: DriftConfig, beta: FloatArray, covariance: FloatArray, step_s: float, span_V: float
+        self,
+        config: DriftConfig,
+        beta: FloatArray,
+        covariance: FloatArray,
+        step_s: float,
+        span_V: float,
+        record: Any = None,
+        arrays: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         p = beta.shape[0]
         if covariance.shape != (p, p):
@@ -279,10 +293,10 @@ class DriftFilter:
         self.config = config
         self.step_s = step_s
         self.span_V = span_V
-        self.state = DriftState(slow_V2=(config.noise * span_V) ** 2, fast_V2=0.0)
-        self._x = np.array(beta, dtype=np.float64)
-        self._P = np.array(covariance, dtype=np.float64, order="C")
-        self._k, self._row = np.empty(p), np.empty(p)
+        self.record = np.zeros((), record_of(DriftFilter)) if record is None else record
+        self.state = DriftState(slow_V2=(config.noise * span_V) ** 2)
+        self._x, self._P = arrays or (np.empty(p), np.empty((p, p)))
+        self._x[:], self._P[:] = beta, covariance
         walk, burst = np.full(p, config.shape_walk), np.zeros(p)
         walk[0], burst[0] = config.offset_walk, config.burst_offset
         if p >= MOTION_COLUMNS:
@@ -306,37 +320,9 @@ class DriftFilter:
         """(p,) variances that each coefficient gains with a step, and with a sudden change, V²."""
         return self._walk.copy(), self._burst.copy()
 
-    def update(self, basis: FloatArray, target_V: float, moving: bool) -> str:
-        """Update with one measurement ``target_V`` of ``basis' beta``; ``basis`` (p,).
-
-        Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
-
-        At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the
-        same basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at
-        one position would change the model at all others, and would give too much weight to the next motion's first
-        samples.
-        """
-        x, P, walk, burst = self._x, self._P, self._walk, self._burst
-        span_V, step_s = self.span_V, self.step_s
-        return update(
-            self.config,
-            self.state,
-            x,
-            P,
-            walk,
-            burst,
-            span_V,
-            step_s,
-            basis,
-            target_V,
-            moving,
-            self._k,
-            self._row,
-        )
-
     def expect_change(self) -> None:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""
-        _expect_change(self.config, self.state, self._x, self._P, self._burst)
+        expect_change(self.config, self.state, self._x, self._P, self._burst)
 
     def mark(self) -> Mark:
         """The estimate as copies, for `restore` and `go_back`."""
@@ -368,8 +354,7 @@ FASTEST_PER_S = 0.02
 STILL_PER_S = 0.1
 
 
-@dataclass(slots=True)
-class RestCreep:
+class RestCreep(Numbers):
     """Creep of a stage at rest, and the move of the frame that compensates it.
 
     To hold a creeping stage in place, the controller slowly reverses the voltage, and this reversal changes the stage's

@@ -11,7 +11,7 @@ in service.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.features import FeatureMap
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers
 from dehyst.adaptive.types import Sample
 
 # --- Gates.
@@ -63,6 +63,8 @@ REASONS = (
     NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, RINGING, UNTRUSTED, SETTLING, SATURATED, OUT_OF_RANGE,
     UNEXCITED, OUTLIER, REDUNDANT, FROZEN, NUMERICS,
 )  # fmt: skip
+#: Results of a sample; compiled code has their numbers.
+OUTCOMES = (LEARNT, PASSED, *REASONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +125,7 @@ class AdmissionConfig:
         return replace(self, glitch_share=self.glitch_share * wider, surprise_share=self.surprise_share * wider)
 
 
-@dataclass(slots=True)
-class AdmissionState:
+class AdmissionState(Numbers):
     """What the gates remember of the samples so far."""
 
     seq: Annotated[int, Entry("the last sample taken", low=-1)] = -1
@@ -196,11 +197,6 @@ def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: flo
     return ""
 
 
-def new_counters() -> dict[str, int]:
-    """All outcomes at zero, so that a report lists every gate."""
-    return dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
-
-
 @shared
 def watch_voltage(state: AdmissionState, u_V: float) -> None:
     """Note a voltage and its kink: the smoother's prediction cannot know the motion that a kink causes."""
@@ -258,6 +254,96 @@ def at_rest(
     if abs(y_um - state.anchor_um) > config.rest_share * range_um:
         state.anchor_um, state.moved = y_um, count
     return (count - state.moved) * dt_s > config.rest_s
+
+
+# --- Errors of the served model: whether it is valid, and whether the identified one predicts better.
+#
+# The error is the measured voltage minus the voltage that the model gives for the measured motion, before the sample is
+# learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
+
+
+#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
+LONG_S, SHORT_S = 2.0, 0.1
+
+#: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
+FALLBACK_RATIO = 1.3
+
+
+class Judgement(Numbers):
+    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model."""
+
+    long_V2: Annotated[float, Entry("mean square error of the learner over long time", "V²", low=0.0)]
+    short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
+    frozen_V2: Annotated[float, Entry("mean square error of the identified model over long time", "V²", low=0.0)]
+    frozen_short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
+    error_V: Annotated[float, Entry("the learner's last error", "V")] = 0.0
+    judged: Annotated[int, Entry("errors", low=0)] = 0
+    inside: Annotated[int, Entry("errors within one stated standard deviation", low=0)] = 0
+    valid: Annotated[bool, Entry("whether the learnt model is valid")] = True
+    fallback: Annotated[bool, Entry("whether the identified model is served because it predicts better")] = False
+    fallen_s: Annotated[float, Entry("for how long", "s", low=0.0)] = 0.0
+    doubt_V2: Annotated[float, Entry("extra variance after a jump of open cause; it decays", "V²", low=0.0)] = 0.0
+
+    @shared
+    def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
+        """Take one error of the learnt and of the frozen model, V."""
+        squared = error_V * error_V
+        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
+        if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
+            self.inside += 1
+        self.error_V = error_V
+        self.judged += 1
+        self.long_V2 += (squared - self.long_V2) * slow
+        self.short_V2 += (squared - self.short_V2) * fast
+        self.doubt_V2 *= 1.0 - fast
+        frozen = frozen_error_V * frozen_error_V
+        self.frozen_V2 += (frozen - self.frozen_V2) * slow
+        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
+
+    @shared
+    def decide(self, enter_V: float, leave_V: float) -> bool:
+        """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
+        rms = sqrt(self.short_V2)
+        if self.valid and rms > leave_V:
+            self.valid = False
+        elif not self.valid and rms < enter_V:
+            self.valid = True
+        return self.valid
+
+    @shared
+    def choose(self, floor_V: float, step_s: float) -> bool:
+        """Whether to serve the frozen model: taken when clearly better, left when worse."""
+        learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
+        if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
+            self.fallback = True
+        elif self.fallback and learnt < frozen:
+            self.fallback = False
+        self.fallen_s = self.fallen_s + step_s if self.fallback else 0.0
+        return self.fallback
+
+    @shared
+    def rolled_back(self) -> None:
+        """The learner has returned to an earlier estimate: count the time of the frozen model from zero."""
+        self.fallen_s = 0.0
+
+    def add_doubt(self, variance_V2: float) -> None:
+        """Add to the stated variance for a jump whose cause is open, V²."""
+        self.doubt_V2 += variance_V2
+
+    @property
+    def std_V(self) -> float:
+        """Standard deviation of the learner's predictions, V: the larger of long and short term."""
+        return sqrt(max(self.long_V2, self.short_V2))
+
+    @property
+    def recent_V(self) -> float:
+        """Rms error over the short term, V."""
+        return sqrt(self.short_V2)
+
+    @property
+    def variance_V2(self) -> float:
+        """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
+        return max(self.long_V2, self.short_V2) + self.doubt_V2
 
 
 # --- The envelope: bounds on the learnt model around the identified one, from the physics of piezo stages.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
-from dehyst.adaptive.state import Entry, load, rows, save
+from dehyst.adaptive.state import Entry, Numbers, load, save
 from dehyst.adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
 from dehyst.adaptive.window import arrays as ws
 from dehyst.adaptive.window import steps
@@ -38,18 +38,20 @@ def due(updates: int, every: int) -> bool:
 SHARE_S = 0.5
 
 
-@dataclass(slots=True)
-class KernelShare:
-    """Steps so far, and the share of the kernel part that recent measurements confirm: its least-squares factor.
+class KernelShare(Numbers):
+    """Numbers of a window: steps so far, and the share of the kernel part that recent measurements confirm.
+
+    The share is the least-squares factor of the kernel part.
 
     The kernel part is local. Where it was learnt from another motion than the present one, it only disturbs the linear
     part, which then learns faster without it.
     """
 
-    product_V2: Annotated[float, Entry("mean product of the kernel part and what the linear part leaves", "V²")]
-    square_V2: Annotated[float, Entry("mean square of the kernel part", "V²", low=0.0)]
+    product_V2: Annotated[float, Entry("mean product of the kernel part and what the linear part leaves", "V²")] = 0.0
+    square_V2: Annotated[float, Entry("mean square of the kernel part", "V²", low=0.0)] = 0.0
     share: Annotated[float, Entry("share of the kernel part that is served", low=0.0, high=1.0)] = 1.0
     clock: Annotated[int, Entry("steps so far", low=0)] = 0
+    kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)] = 0.0
 
     @shared
     def take(self, kernel_V: float, left_V: float, step_s: float) -> None:
@@ -66,22 +68,10 @@ class KernelState:
     """What a `ResidualWindow` holds beside the arrays of its solver."""
 
     born: Annotated[IntArray, Entry("step that each sample came with", "", "N")]
-    share: Annotated[KernelShare, Entry("how much of the kernel part counts", name="")]
-    kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)]
     gamma: Annotated[float, Entry("regularisation", low=0.0)]
     widths: Annotated[tuple[float, ...], Entry("kernel widths", "", "d", low=1e-100)]
     healing: Annotated[HealingState | None, Entry("a new factorisation on its way")]
-
-
-@dataclass(slots=True)
-class KernelSolverState(KernelState):
-    """The same with the arrays of the solver."""
-
     solver: Annotated[SolverState, Entry("arrays of the solver", name="")]
-
-
-#: Entries of the solver in a state.
-_SOLVER = frozenset(row.name for row in rows(SolverState))
 
 
 @shared
@@ -117,48 +107,38 @@ class ResidualWindow:
         eviction: Eviction = "nearest",
         solver: SolverConfig | None = None,
         arrays: WindowArrays | None = None,
+        share: KernelShare | None = None,
+        born: IntArray | None = None,
     ) -> None:
+        """``arrays``, ``share`` and ``born`` : where its state is kept; of its own unless given."""
         self.eviction: Eviction = eviction
         widths = tuple(float(w) for w in model.widths)
         s = solver or SolverConfig()
         self._config = WindowConfig(capacity, widths, model.gamma, s.form, s.accuracy)
-        #: Variance of the kernel part away from samples, V².
-        self.kernel_variance = model.kernel_variance
         self._window = Window(self._config, arrays)
         self._healing = Healing(self._window)
-        self._born = np.zeros(capacity, dtype=np.int64)
-        self._share = KernelShare(0.0, 0.0)
+        self._born = np.zeros(capacity, dtype=np.int64) if born is None else born
+        self._share = share or KernelShare()
+        self._share.share, self._share.kernel_variance = 1.0, model.kernel_variance
 
     @classmethod
-    def from_model(
-        cls, model: LssvmInverse, capacity: int, eviction: Eviction = "nearest", solver: SolverConfig | None = None
-    ) -> ResidualWindow:
-        """A window that holds a model's samples and predicts as its kernel part does; the last ``capacity`` of them."""
-        made = cls(capacity, model, eviction, solver)
+    def from_model(cls, model: LssvmInverse, capacity: int, *others: Any) -> ResidualWindow:
+        """A window that holds a model's samples and predicts as its kernel part does; the last ``capacity`` of them.
+
+        ``others`` : as of the constructor; ``arrays`` that are given hold the samples already.
+        """
+        made = cls(capacity, model, *others)
         n = model.support.shape[0]
-        if n:
+        if n and not len(made):
             # The targets follow from the solution: y = K alpha + alpha / gamma. Its bias is in the linear part.
             targets = features.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
-        return made._begun()
-
-    @classmethod
-    def over(
-        cls, arrays: WindowArrays, model: LssvmInverse, eviction: Eviction, solver: SolverConfig
-    ) -> ResidualWindow:
-        """A window whose state is in arrays that another owns, with the hyper-parameters of ``model``.
-
-        `restore` with ``arrays=False`` sets what is not in them.
-        """
-        return cls(arrays.S.size, model, eviction, solver, arrays)._begun()
-
-    def _begun(self) -> ResidualWindow:
-        """Itself, with a share of 1; the weight of this start is the mean square of the kernel part at its samples."""
-        if len(self._window):
-            self._share.product_V2 = self._share.square_V2 = float(np.mean(self._at_samples_V**2))
-        return self
+        if len(made):
+            # The weight of a share of 1 is the mean square of the kernel part at its samples.
+            made._share.product_V2 = made._share.square_V2 = float(np.mean(made._at_samples_V**2))
+        return made
 
     def __len__(self) -> int:
         return len(self._window)
@@ -167,6 +147,20 @@ class ResidualWindow:
     def window_arrays(self) -> WindowArrays:
         """The state of the solver; written in place by each step."""
         return self._window.arrays
+
+    def take_arrays(self, arrays: WindowArrays) -> None:
+        """Continue with other arrays of the same sizes."""
+        self._window.take_arrays(arrays)
+
+    @property
+    def handle(self) -> IntArray:
+        """The handle of ``window_arrays``; another one after a healing."""
+        return self._window.handle
+
+    @property
+    def kernel_variance(self) -> float:
+        """Variance of the kernel part away from samples, V²."""
+        return self._share.kernel_variance
 
     @property
     def heals(self) -> bool:
@@ -210,10 +204,6 @@ class ResidualWindow:
     def mean(self, kernel: FloatArray) -> float:
         """The share of it that is served, V."""
         return self._share.share * self._window.predict(kernel)
-
-    def weigh(self, kernel_V: float, left_V: float, step_s: float) -> None:
-        """Take one measurement for the share; see `KernelShare.take`."""
-        self._share.take(kernel_V, left_V, step_s)
 
     def learn(self, kernel: FloatArray, target_V: float) -> str:
         """Learn one sample. Returns "learnt", or "numerics" where the step was refused and undone.
@@ -267,49 +257,42 @@ class ResidualWindow:
         made = object.__new__(ResidualWindow)
         c = self._config
         made.eviction, made._born = self.eviction, self._born.copy()
-        made._share = replace(self._share)
+        made._share = KernelShare(record=self._share.record.copy())
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
         made._config = WindowConfig(c.capacity, widths, float(hyper.gamma), c.form, c.accuracy)
-        made.kernel_variance = self.kernel_variance
         made._window = Window(made._config)
         if len(self._window):
             made._window = self._window.with_hyperparameters(widths, float(hyper.gamma))
-            made.kernel_variance = made._window.scale
+            made._share.kernel_variance = made._window.scale
         made._healing = Healing(made._window)
         made._window.arrays.C[ws.EVENTS] += self._window.arrays.C[ws.EVENTS]
         return made
+
+    def become(self, other: ResidualWindow) -> None:
+        """Continue as a window of the same samples with other hyper-parameters."""
+        self._config, self._window, self._healing = other._config, other._window, other._healing
+        self._share.record[...] = other._share.record
 
     def _newest(self, count: int) -> IntArray:
         return np.argsort(-self._born[: len(self._window)], kind="stable")[:count]
 
     # ---- keeping
 
-    def state_dict(self, arrays: bool = True) -> StateDict:
-        """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
+    def state_dict(self) -> StateDict:
+        """All arrays under flat names, and their hyper-parameters; the numbers are its owner's."""
         c, healing = self._config, self._healing.state()
-        kept = (
-            self._born.copy(), self._share, self.kernel_variance, c.gamma, c.widths, healing,
-        )  # fmt: skip
-        return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
+        return save(KernelState(self._born.copy(), c.gamma, c.widths, healing, self._window.state()), copies=False)
 
-    def read(self, values: StateDict, arrays: bool = True) -> KernelState:
-        """A ``state_dict`` for `take`. Raises ModelFileError where it does not fit.
-
-        ``arrays=False`` : the entries of the solver are left aside.
-        """
-        sizes = {"N": self._config.capacity, "d": self._config.dimension}
-        if arrays:
-            return load(KernelSolverState, values, sizes)
-        return load(KernelState, {name: value for name, value in values.items() if name not in _SOLVER}, sizes)
+    def read(self, values: StateDict) -> KernelState:
+        """A ``state_dict`` for `take`. Raises ModelFileError where it does not fit."""
+        return load(KernelState, values, {"N": self._config.capacity, "d": self._config.dimension})
 
     def take(self, state: KernelState) -> None:
-        """Continue from ``state``; the solver's arrays stay where it holds none."""
-        c, kept = self._config, self._window.arrays
+        """Continue from ``state``."""
+        c = self._config
         self._config = WindowConfig(c.capacity, state.widths, state.gamma, c.form, c.accuracy)
-        solver = state.solver if isinstance(state, KernelSolverState) else None
-        self._window = Window(self._config, kept) if solver is None else Window.of(self._config, solver)
+        self._window = Window.of(self._config, state.solver)
         self._healing = Healing.of(self._window, state.healing)
-        self._born, self._share = state.born, state.share
-        self.kernel_variance = state.kernel_variance
+        self._born[:] = state.born

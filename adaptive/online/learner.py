@@ -8,29 +8,33 @@ so that a change is learnt once and the old samples of the window stay valid.
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, replace
-from math import inf, isfinite, sqrt
-from typing import Annotated, Any
+from collections.abc import Mapping
+from dataclasses import replace
+from math import inf, sqrt
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 
-from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.errors import DehystError, ModelFileError
 from dehyst.adaptive.features import ACCELERATION, VELOCITY, FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online import gates as admission
+from dehyst.adaptive.online import step as order
 from dehyst.adaptive.online.config import LearnerConfig
 from dehyst.adaptive.online.drift import DriftFilter, Mark, RestCreep
-from dehyst.adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
-from dehyst.adaptive.online.glitch_or_jump import level_of
+from dehyst.adaptive.online.gates import OUTCOMES, Judgement
+from dehyst.adaptive.online.glitch_or_jump import MOST_BRIDGED, level_of
 from dehyst.adaptive.online.intake import Intake
-from dehyst.adaptive.online.kernel_window import ResidualWindow, due
-from dehyst.adaptive.online.track import MissingMotion, Pair, Reckoning, drive_V
-from dehyst.adaptive.state import Entry, Refused, restore, save, within
+from dehyst.adaptive.online.kernel_window import KernelShare, ResidualWindow
+from dehyst.adaptive.online.row import Row
+from dehyst.adaptive.online.step import SAMPLE
+from dehyst.adaptive.online.track import MissingMotion, Reckoning, Step, answers, drive_V
+from dehyst.adaptive.smoothing import smoother_of
+from dehyst.adaptive.state import Entry, Numbers, record_of, restore, save, within
 from dehyst.adaptive.types import (
     FloatArray,
     Hyperparameters,
+    IntArray,
     InverseModel,
     MovingPart,
     OnlineModel,
@@ -38,129 +42,14 @@ from dehyst.adaptive.types import (
     StateDict,
     WindowData,
     joined,
+    parted,
     prefixed,
     under,
 )
-
-# --- Errors of the served model: whether it is valid, and whether the identified one predicts better.
-#
-# The error is the measured voltage minus the voltage that the model gives for the measured motion, before the sample is
-# learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
-
-
-#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
-LONG_S, SHORT_S = 2.0, 0.1
-
-#: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
-FALLBACK_RATIO = 1.3
-
-
-@dataclass(slots=True)
-class Judgement:
-    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model."""
-
-    long_V2: Annotated[float, Entry("mean square error of the learner over long time", "V²", low=0.0)]
-    short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
-    frozen_V2: Annotated[float, Entry("mean square error of the identified model over long time", "V²", low=0.0)]
-    frozen_short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
-    error_V: Annotated[float, Entry("the learner's last error", "V")] = 0.0
-    judged: Annotated[int, Entry("errors", low=0)] = 0
-    inside: Annotated[int, Entry("errors within one stated standard deviation", low=0)] = 0
-    valid: Annotated[bool, Entry("whether the learnt model is valid")] = True
-    fallback: Annotated[bool, Entry("whether the identified model is served because it predicts better")] = False
-    fallen_s: Annotated[float, Entry("for how long", "s", low=0.0)] = 0.0
-    doubt_V2: Annotated[float, Entry("extra variance after a jump of open cause; it decays", "V²", low=0.0)] = 0.0
-
-    @shared
-    def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
-        """Take one error of the learnt and of the frozen model, V."""
-        squared = error_V * error_V
-        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
-        if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
-            self.inside += 1
-        self.error_V = error_V
-        self.judged += 1
-        self.long_V2 += (squared - self.long_V2) * slow
-        self.short_V2 += (squared - self.short_V2) * fast
-        self.doubt_V2 *= 1.0 - fast
-        frozen = frozen_error_V * frozen_error_V
-        self.frozen_V2 += (frozen - self.frozen_V2) * slow
-        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
-
-    @shared
-    def decide(self, enter_V: float, leave_V: float) -> bool:
-        """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
-        rms = sqrt(self.short_V2)
-        if self.valid and rms > leave_V:
-            self.valid = False
-        elif not self.valid and rms < enter_V:
-            self.valid = True
-        return self.valid
-
-    @shared
-    def choose(self, floor_V: float, step_s: float) -> bool:
-        """Whether to serve the frozen model: taken when clearly better, left when worse."""
-        learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
-        if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
-            self.fallback = True
-        elif self.fallback and learnt < frozen:
-            self.fallback = False
-        self.fallen_s = self.fallen_s + step_s if self.fallback else 0.0
-        return self.fallback
-
-    def rolled_back(self) -> None:
-        """The learner has returned to an earlier estimate: count the time of the frozen model from zero."""
-        self.fallen_s = 0.0
-
-    def add_doubt(self, variance_V2: float) -> None:
-        """Add to the stated variance for a jump whose cause is open, V²."""
-        self.doubt_V2 += variance_V2
-
-    @property
-    def std_V(self) -> float:
-        """Standard deviation of the learner's predictions, V: the larger of long and short term."""
-        return sqrt(max(self.long_V2, self.short_V2))
-
-    @property
-    def recent_V(self) -> float:
-        """Rms error over the short term, V."""
-        return sqrt(self.short_V2)
-
-    @property
-    def variance_V2(self) -> float:
-        """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
-        return max(self.long_V2, self.short_V2) + self.doubt_V2
-
-
-class Delay:
-    """The last ``steps`` + 1 coefficient vectors: errors are those of the model as it was ``steps`` ago."""
-
-    _past: Annotated[deque[FloatArray], Entry("linear parts of late, oldest first", "V", "*,p|0", name="delay")]
-
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-        self._past = deque(maxlen=steps + 1)
-
-    def push(self, vector: FloatArray) -> FloatArray:
-        """Take the newest, return the oldest kept."""
-        self._past.append(vector)
-        return self._past[0]
-
-    def shift(self, by: float) -> None:
-        """Add to the first entry of all kept."""
-        for vector in self._past:
-            vector[0] += by
-
-
-# --- The learner.
+from dehyst.adaptive.window.arrays import WindowArrays, handle_of
 
 #: Names of the events that are counted beside the samples.
 EVENTS = ("fallbacks", "rollbacks", "distrusts", "adoptions", "adoptions_refused")
-
-#: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
-#: marked this often, s. The readings are judged by one that is older, between one and two such times: a newer one has
-#: already taken in a part of what has begun to go wrong.
-ROLLBACK_S, MARK_S, REFERENCE_S = 0.5, 0.1, 1.0
 
 #: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
@@ -172,12 +61,85 @@ NEWEST = 100
 MOST_MOVED = 2.0
 
 
-class Parts:
+# --- The arrays and numbers of an axis, for the compiled order (`adaptive.online.step`).
+
+
+def _structured(numbers: StateDict) -> Any:
+    """The structured type of flat numbers, nested by their names."""
+    fields = parted(numbers).items()
+    return np.dtype([(name, type(of[""]) if "" in of else _structured(of)) for name, of in fields], align=True)
+
+
+def _nested(numbers: StateDict) -> Any:
+    return tuple(of[""] if "" in of else _nested(of) for of in parted(numbers).values())
+
+
+def _numbers(state: StateDict) -> StateDict:
+    return {name: value for name, value in state.items() if isinstance(value, bool | int | float)}
+
+
+def config_record(config: LearnerConfig, dt_s: float) -> Any:
+    """(1,) the configuration and what follows from it and the sample time, for compiled code."""
+    step_s = config.filter_every * dt_s
+    checks = max(1, round(CHECK_S / step_s))
+    steps = {
+        "dt_s": float(dt_s), "step_s": float(step_s), "check_s": float(checks * step_s),
+        "check_every": checks * config.filter_every, "mark_every": max(1, round(order.MARK_S / step_s)),
+        "reference_every": max(1, round(order.REFERENCE_S / step_s)), "window_every": config.window_every,
+        "fifo": config.eviction == "fifo", "lag": config.smoother(dt_s).lag,
+    }  # fmt: skip
+    given = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
+    kinds = _numbers(LearnerConfig().state_dict() | steps)
+    return np.array([_nested({name: type(kind)(given[name]) for name, kind in kinds.items()})], _structured(kinds))
+
+
+class Home(NamedTuple):
+    """Where a learner keeps its numbers and arrays: of its own, or the row of a fleet.
+
+    numbers : (1,) record of `NUMBERS`. config : see `config_record`. row : its arrays. window : what the window begins
+    as, and is to be stepped in; None: made from the model.
+    """
+
+    numbers: Any
+    config: Any
+    row: Row
+    window: WindowArrays | None = None
+
+
+def allocate(count: int, base: LssvmInverse, config: LearnerConfig) -> dict[str, Any]:
+    """The arrays of ``count`` rows by name, but for constants: the first index is the axis."""
+    f, smoother = base.features, config.smoother(base.dt_s)
+    p, d, m, lag, order = f.basis_size, f.kernel_size, f.memory_size, smoother.lag, smoother.order
+    ages = round(config.serving_age_s / (config.filter_every * base.dt_s)) + 1
+    shapes: dict[str, tuple[int, ...]] = {
+        "x": (order,), "ring": (lag + 1, 4), "drive_x": (order,), "drive_ring": (lag + 1, 4), "voltages": (lag + 2,),
+        "readings": (lag + 2,), "good": (lag + 2,), "motion": (3,), "rates": (2,), "known": (3, 2), "memory": (m,),
+        "frozen_memory": (m,), "frames": (2, 4), "beta": (p,), "covariance": (p, p), "mark_beta": (2, p),
+        "mark_covariance": (2 * p, p), "references": (2, p), "delay": (ages, p), "domain": (6,), "basis": (p,),
+        "point": (d,), "born": (config.window,), "past_motion": (2, 4), "past_V": (2, lag), "past_um": (2, lag),
+        "past_memory": (2, m), "past_ring": (MOST_BRIDGED + 2,), "past_from": (2,), "counters": (len(OUTCOMES),),
+    }  # fmt: skip
+    whole = ("good", "born", "past_from", "counters")
+    return {n: np.zeros((count, *shape), np.int64 if n in whole else np.float64) for n, shape in shapes.items()}
+
+
+def row_in(arrays: Mapping[str, Any], axis: int, base: LssvmInverse, config: LearnerConfig) -> Row:
+    """The row of an axis in what `allocate` gave."""
+    model, sizes = base.packed
+    smoother = smoother_of(config.smoother(base.dt_s))
+    p = base.features.basis_size
+    return Row(
+        **{name: array[axis] for name, array in arrays.items()}, walks=np.empty(p), bursts=np.empty(p), model=model,
+        sizes=sizes, transition=smoother.transition, gain=smoother.gain, lag_gains=smoother.lag_gains,
+        scale=smoother.scale,
+    )  # fmt: skip
+
+
+class Parts(Numbers):
     """The changing state of a learner, and the operations on several of its parts.
 
     first : the filter's estimate of the identified model.
     window : the kernel part, whose state is among the entries ``window``.
-    check_every, check_s : samples between two checks of the sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     """
 
@@ -185,105 +147,81 @@ class Parts:
     filter: Annotated[DriftFilter, Entry("filter of the linear part")]
     rest: Annotated[RestCreep, Entry("creep at rest")]
     judgement: Annotated[Judgement, Entry("errors at the age of serving")]
-    delay: Annotated[Delay, Entry("estimates of late", name="")]
+    share: Annotated[KernelShare, Entry("numbers of the window")]
+    frozen: Annotated[bool, Entry("whether learning is stopped")]
+    delay: Annotated[FloatArray, Entry("ring of linear parts of late", "V", "ages,p")]
+    delayed: Annotated[int, Entry("linear parts so far", low=0)]
     domain: Annotated[FloatArray, Entry("learnt range, as of the snapshot", "µm, µm/s, µm/s²", "6")]
     point: Annotated[FloatArray, Entry("kernel inputs of the last instant due for learning", "", "d", finite=False)]
-    counters: Annotated[dict[str, int], Entry("samples by outcome", low=0, among=(LEARNT, PASSED, *REASONS))]
-    events: Annotated[dict[str, int], Entry("events by name", low=0, among=EVENTS)]
-    # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
-    mark: Annotated[Mark, Entry("a good estimate of the filter")]
-    next_mark: Annotated[Mark, Entry("a newer one")]
+    counters: Annotated[IntArray, Entry("samples by outcome", "", "outcomes", low=0)]
+    fallbacks: Annotated[int, Entry("times that the identified model came to be served", low=0)]
+    rollbacks: Annotated[int, Entry("returns to an earlier estimate because of them", low=0)]
+    distrusts: Annotated[int, Entry("returns because the readings do not follow", low=0)]
+    adoptions: Annotated[int, Entry("hyper-parameters adopted", low=0)]
+    adoptions_refused: Annotated[int, Entry("and refused", low=0)]
+    # The good estimate before the last and the last one, because that may already contain a beginning fault.
+    mark_beta: Annotated[FloatArray, Entry("good estimates of the filter, the older first", "V", "2,p")]
+    mark_covariance: Annotated[FloatArray, Entry("their covariances, one below the other", "V²", "2p,p")]
     references: Annotated[FloatArray, Entry("good estimates that judge the readings, the older first", "V", "2,p")]
 
-    def __init__(
-        self,
-        base: LssvmInverse,
-        config: LearnerConfig,
-        window: ResidualWindow | None = None,
-        allowed_V: float | None = None,
-    ) -> None:
+    def __init__(self, base: LssvmInverse, config: LearnerConfig, home: Home | None = None) -> None:
         self.config = config
-        self.intake = Intake(base, config)
+        if home is None:
+            row = row_in(allocate(1, base, config), 0, base, config)
+            home = Home(np.zeros(1, NUMBERS), config_record(config, base.dt_s), row)
+        self.home, row = home, home.row
+        numbers = home.numbers.reshape(())
+        self.record, self.sample, self.handle = numbers, numbers["sample"], handle_of(row)
         p = base.features.basis_size
         covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
         step_s = config.filter_every * base.dt_s
-        self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
+        self.intake = Intake(self.record["intake"], row, base, config)
+        self.filter = DriftFilter(
+            config.drift, base.beta, covariance, step_s, base.span_V, numbers["filter"], (row.beta, row.covariance)
+        )
+        row.walks[:], row.bursts[:] = self.filter.variances
         self.first = self.filter.mark()
-        self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
-        self.mark = self.filter.mark()
-        self.next_mark = self.mark
-        self.references = np.stack([base.beta, base.beta])
-        self.domain = base.domain.copy()
-        self.point = np.full(base.features.kernel_size, np.nan)
+        c, share = config, self.share
+        own = home.window, share, row.born
+        self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver, *own)
+        self.mark_beta, self.mark_covariance, self.references = row.mark_beta, row.mark_covariance, row.references
+        self._mark_now()
+        self.domain, self.point, self.delay, self.counters = row.domain, row.point, row.delay, row.counters
+        self.domain[:], self.point[:] = base.domain, np.nan
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
         self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
         self.rest = RestCreep()
-        self.delay = Delay(round(config.serving_age_s / step_s))
-        steps = max(1, round(CHECK_S / self.filter.step_s))
-        self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
         # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
-        if allowed_V is None:
-            allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
-        self.allowed_V = allowed_V
-        self.counters = new_counters()
-        self.events = dict.fromkeys(EVENTS, 0)
+        self.allowed_V = c.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
+        f, fixed = base.features, numbers["fixed"]
+        fixed["middle_um"], fixed["range_um"] = 0.5 * (f.y_max_um + f.y_min_um), f.y_max_um - f.y_min_um
+        fixed["span_V"], fixed["drive_V"], fixed["tells"] = base.span_V, drive_V(base), answers(base)
+        fixed["allowed_V"], self.intake.judgement = self.allowed_V, self.judgement
 
-    def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, rest: bool) -> bool:
-        """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
+    def roll_back(self) -> None:
+        """The identified model was better for long: take back what was learnt since the last good estimate, and jumps
+        that the identified model does not have."""
+        self.judgement.rolled_back()
+        self.intake.to_base_frame()
+        self.filter.go_back(self.mark)
+        # If that estimate does not end it either, the next to return to is the identified one.
+        self._mark(self.first)
+        self.rollbacks += 1
 
-        ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
-        """
-        left_V = pair.u_V - float(basis.dot(self.filter.beta))
-        if self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest) == "outlier":
-            return False
-        if not rest:
-            self.window.weigh(kernel_V, left_V, self.filter.step_s)
-        self.take_rest(pair.u_V, moving=not rest)
-        if self.judgement.valid and not rest:
-            self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
-            self.intake.learn_rates(pair.rates)
-        return True
+    @property
+    def mark(self) -> Mark:
+        """The good estimate to return to; a view."""
+        return Mark(self.mark_beta[0], self.mark_covariance[: self.mark_beta.shape[1]])
 
-    def take_rest(self, u_V: float, moving: bool) -> None:
-        """After a step of the filter at rest: move the gain of the constant to the frame."""
-        intake, f = self.intake, self.filter
-        if moving:
-            self.rest.leave()
-            return
-        constant_V, creep_s = float(f.beta[0]), self.config.creep_s
-        shift_um = self.rest.shift_um(constant_V, u_V, f.span_V, intake.range_um, f.step_s, creep_s)
-        if shift_um:
-            intake.creep(shift_um)
-
-    def judge(self, error_V: float, frozen_error_V: float) -> None:
-        """Take the errors of the model as it was served at this instant, and of the frozen model, V."""
-        c, j, step_s = self.config, self.judgement, self.filter.step_s
-        span_V = self.filter.span_V
-        j.take(error_V, frozen_error_V, step_s)
-        j.decide(c.valid_enter * span_V, c.valid_leave * span_V)
-        before = j.fallback
-        self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
-        if j.fallen_s > ROLLBACK_S:
-            # The frozen model was better for half a second: take back what was learnt since the last good estimate,
-            # and jumps that the frozen model does not have.
-            j.rolled_back()
-            self.intake.to_base_frame()
-            self.filter.go_back(self.mark)
-            # If that estimate does not end it either, the next to return to is the identified one.
-            self.mark = self.next_mark = self.first
-            self.references[:] = self.first.beta
-            self.events["rollbacks"] += 1
-        elif j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
-            if j.judged % max(1, round(MARK_S / step_s)) == 0:
-                self.mark, self.next_mark = self.next_mark, self.filter.mark()
-            if j.judged % max(1, round(REFERENCE_S / step_s)) == 0:
-                self.references[0], self.references[1] = self.references[1], self.filter.beta
-                self.intake.mark_rates()
+    @property
+    def next_mark(self) -> Mark:
+        """A newer one; a view."""
+        return Mark(self.mark_beta[1], self.mark_covariance[self.mark_beta.shape[1] :])
 
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
-        self.events["distrusts"] += 1
+        self.distrusts += 1
 
     def take_jump(self, jump_um: float, first: bool) -> None:
         """The frame has moved by ``jump_um``, µm; ``first``: see ``Taken``."""
@@ -294,26 +232,17 @@ class Parts:
 
     def _mark_now(self) -> None:
         """The present estimate is the one to return to."""
-        self.mark = self.next_mark = self.filter.mark()
-        self.references[:] = self.mark.beta
+        self._mark(self.filter.mark())
 
-    def widen_domain(self, motion: tuple[float, float, float]) -> None:
-        """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
-        ends = self.domain.tolist()
-        for i, x in enumerate(motion):
-            if x < ends[2 * i]:
-                self.domain[2 * i] = x
-            if x > ends[2 * i + 1]:
-                self.domain[2 * i + 1] = x
+    def _mark(self, mark: Mark) -> None:
+        self.mark_beta[:], self.references[:] = mark.beta, mark.beta
+        self.mark_covariance[:] = np.tile(mark.covariance, (2, 1))
 
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part: now, in all marks, and in the delayed estimates."""
         self.filter.shift_constant(by_V)
-        marks = (self.mark, self.next_mark)
-        for beta, _ in {id(m): m for m in marks}.values():
-            beta[0] += by_V
-        self.references[:, 0] += by_V
-        self.delay.shift(by_V)
+        for kept in (self.mark_beta, self.references, self.delay):
+            kept[:, 0] += by_V
 
     @property
     def missing_V2(self) -> float:
@@ -377,37 +306,45 @@ class Parts:
         limit_V = MOST_MOVED * sqrt(self.judgement.variance_V2)
         if not moved_V <= limit_V:
             return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
-        self.window = challenger
+        window.become(challenger)
         self.shift_constant(shift_V)
         return ""
 
-    @property
-    def ordinary(self) -> bool:
-        """Whether samples are learnt in the ordinary way: nothing is in doubt, and nothing is being repaired."""
-        return self.intake.ordinary and not self.window.heals
-
     # ---- keeping
 
-    def state_dict(self, arrays: bool = True) -> StateDict:
-        """The whole changing state under flat names; ``arrays=False``: without the arrays of the window's solver."""
-        return save(self) | prefixed("window.", self.window.state_dict(arrays))
+    def state_dict(self) -> StateDict:
+        """The whole changing state under flat names."""
+        return save(self) | prefixed("window.", self.window.state_dict())
 
-    def restore(self, state: StateDict, arrays: bool = True) -> None:
+    def restore(self, state: StateDict) -> None:
         """Inverse of ``state_dict``. Raises ModelFileError where it does not fit; then nothing is changed."""
         own = {name: value for name, value in state.items() if not name.startswith("window.")}
         with within("window."):
-            window = self.window.read(under("window.", state), arrays)
-        restore(self, own, self.intake.sizes, {"intake": self.intake.given})
+            window = self.window.read(under("window.", state))
+        p, ages = self.delay.shape[::-1]
+        sizes = {"ages": ages, "2p": 2 * p, "outcomes": len(OUTCOMES)}
+        restore(self, own, self.intake.sizes | sizes, {"intake": self.intake.given})
         self.window.take(window)
+        self.note_healing()
+
+    def note_healing(self) -> None:
+        """Tell the compiled order whether the window is healing: then its steps are made in Python."""
+        self.sample["heals"] = self.window.heals
+
+
+#: Numbers of an axis: its state, its sample, and what does not change.
+NUMBERS: Final = np.dtype([
+    *((name, kind) for name, (kind, *_) in record_of(Parts).fields.items()), ("sample", SAMPLE),
+    ("fixed", np.dtype([("middle_um", "f8"), ("range_um", "f8"), ("span_V", "f8"), ("drive_V", "f8"), ("tells", "?"),
+                        ("allowed_V", "f8")], align=True)),
+], align=True)  # fmt: skip
 
 
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     """Load or compile every step of a learner, on parts that are thrown away."""
     parts = Parts(base, config)
-    basis, kernel = np.empty(base.features.basis_size), np.empty(base.features.kernel_size)
-    base.features.fill(0.0, 0.0, 0.0, base.rest_memory(0.0), basis, kernel)
-    base.mean(basis, kernel)
-    window = parts.window
+    window, kernel = parts.window, np.zeros(base.features.kernel_size)
+    window.predict(kernel)
     if len(window) < config.window:
         window.learn(10.0 + np.zeros_like(kernel), 0.0)
     window.learn(window.arrays()[0][0], 0.0)
@@ -420,9 +357,11 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     gap.correct((y, 0.0, 0.0), 0.0, 1.0)
     level_of(np.arange(8.0) % 3.0, 1.0)
     window.with_hyperparameters(window.hyper).newest_error_V(1)
-    for moving in (True, False):
-        parts.filter.update(basis, 0.0, moving)
     parts.filter.expect_change()
+    Learner(base, config).handle(Sample(0, 0.0, 0.0, y))
+
+
+_NO_SAMPLE: Final = Sample(0, 0.0, 0.0, 0.0)
 
 
 class Learner:
@@ -431,39 +370,21 @@ class Learner:
     Not for several threads at once: one thread calls ``handle`` and ``snapshot``; snapshots may be used anywhere.
     """
 
-    def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None) -> None:
-        self._begin(model, config or LearnerConfig())
-
-    def _begin(
-        self,
-        model: LssvmInverse,
-        config: LearnerConfig,
-        window: ResidualWindow | None = None,
-        allowed_V: float | None = None,
-    ) -> None:
-        self.config = config
+    def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None, home: Home | None = None) -> None:
+        """``home`` : where its state is kept; of its own unless given."""
+        self.config = config = config or LearnerConfig()
         self.base = model
-        self.parts = Parts(model, config, window, allowed_V)
-        features = model.features
-        self._basis = np.empty(features.basis_size)
-        self._frozen_basis, self._frozen_kernel = self._basis.copy(), np.empty(features.kernel_size)
-        self._frozen = False
+        self.parts = Parts(model, config, home)
         self._cache: LssvmInverse | None = None
+
+    def __reduce__(self) -> Any:
+        # Addresses are valid for one object only: a copy makes its own.
+        return type(self).from_state, (self.state_dict(),)
 
     @classmethod
     def from_model(cls, model: LssvmInverse, config: LearnerConfig | None = None) -> Learner:
         """A learner that starts from an identified model."""
         return cls(model, config)
-
-    @classmethod
-    def around(cls, model: LssvmInverse, config: LearnerConfig, window: ResidualWindow, allowed_V: float) -> Learner:
-        """A learner that steps a window which another owns, with the bound of a learner of the same model, V.
-
-        `resume` gives it a state.
-        """
-        made = cls.__new__(cls)
-        made._begin(model, config, window, allowed_V)
-        return made
 
     # ---- samples in
 
@@ -474,9 +395,13 @@ class Learner:
 
     def handle(self, sample: Sample) -> str:
         """Take one sample. Returns "learnt", "passed" (no step was due), or the name of the gate that refused it."""
-        outcome = self._handle(sample)
-        self.parts.counters[outcome] += 1
-        return outcome
+        parts = self.parts
+        stage = self._run(order.TAKE, sample)
+        if stage != order.DONE:
+            self.go_on(stage)
+        if parts.sample["due"]:
+            self._cache = None
+        return OUTCOMES[parts.sample["outcome"]]
 
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number, after the stage itself began anew."""
@@ -491,101 +416,107 @@ class Learner:
             self.resync()
             return
         mine, its = self.parts.intake, other.parts.intake
-        if its.track is None:
+        if not its.track.begun:
             self.resync()
             return
         mine.go_on_as(its)
 
-    def _handle(self, sample: Sample) -> str:
-        parts, intake = self.parts, self.parts.intake
-        taken = intake.take(sample, self.snapshot, parts.judgement.std_V, parts.judgement.recent_V)
+    def go_on(self, stage: int) -> None:
+        """What is rare about a sample that the compiled order has left at ``stage``, and the rest of its way."""
+        parts = self.parts
+        parts.sample["rare"] = True
+        if stage <= order.CONTROLLED:
+            stage = self._take(stage)
+        self._go_on(stage)
+        parts.counters[parts.sample["outcome"]] += 1
+
+    def _take(self, stage: int) -> int:
+        """The intake of a sample. Returns the stage at which it goes on."""
+        parts, intake, t = self.parts, self.parts.intake, self.parts.sample
+        sample = Sample(t["seq"].item(), t["t_s"].item(), t["u_V"].item(), t["y_um"].item())
+        before_V, missing = t["before_V"].item(), t["missing"].item()
+        refused = OUTCOMES[t["refused"]] if t["refused"] >= 0 else ""
+        if stage == order.CONTROLLED:
+            intake.check_model(sample, self.snapshot)
+            return order.ADVANCE
+        if stage == order.TRIED:
+            taken = intake.take_tried(sample, before_V, missing, refused)
+        elif stage == order.GAPPED:
+            taken = intake.after_gap(sample, missing, self.snapshot)
+        else:
+            taken = intake.take_held(sample, before_V, missing, refused, t["limit"].item(), self.snapshot)
         if taken.distrusted:
             self._go_on_without_readings()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, taken.first)
-            if intake.track is not None and intake.track.features is intake.track.served:
+            if not intake.track.jumps:
                 parts.filter.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
-        moved = taken.jump_um or taken.distrusted or taken.renamed
-        if moved or taken.refused == admission.GAP:
+        if taken.jump_um or taken.distrusted or taken.renamed or taken.refused == admission.GAP:
             self._cache = None
-        outcome = taken.refused
-        for step in taken.steps:
-            pair, switched = intake.advance(step)
-            if switched:
-                parts.filter.expect_change()
-            if not taken.refused:
-                outcome = admission.SETTLING if pair is None else self.teach(pair)
-        return outcome
+        t["outcome"] = OUTCOMES.index(taken.refused) if taken.refused else -1
+        for step in taken.steps[:-1]:
+            self._go_on(self._begin(step, not taken.refused))
+        if not taken.steps:
+            return order.DONE
+        return self._begin(taken.steps[-1], not taken.refused)
 
-    def teach(self, pair: Pair) -> str:
-        """Learn the pair at the smoothed instant, in filter and window, if the gates allow it."""
-        c, parts, intake = self.config, self.parts, self.parts.intake
-        track = intake.track
-        assert track is not None
-        waits = self._waits(pair)
-        if waits:
-            return waits
-        refused = check_pair(c.admission, *pair.applied_V, pair.y_um)
-        # A saturated sample is not learnt, but it shows where the stage is, and so the error of the model.
-        if refused and refused != admission.SATURATED:
-            return refused
-        if pair.now % c.filter_every:
-            return refused or admission.PASSED
-        motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
-        track.features.fill(*motion, track.memory, self._basis, parts.point)
-        rest = intake.rests(pair.y_um)
-        kernel_V = parts.window.predict(parts.point)
-        target = pair.u_V - parts.window.share * kernel_V
-        beta = parts.filter.beta
-        if not isfinite(target):
-            return admission.NUMERICS
-        self.base.features.fill(*motion, track.frozen_memory, self._frozen_basis, self._frozen_kernel)
-        frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
-        served_V = float(self._basis.dot(parts.delay.push(beta)))
-        parts.judge(target - served_V, pair.u_V - frozen_V)
-        if pair.now % parts.check_every == 0:
-            found = self._check(pair, target, bool(refused))
-            if found:
-                return found
-        # Where nothing is learnt, the stated deviation is of the errors until now all the same.
-        self._cache = None
-        if refused:
-            return refused
-        if self._frozen:
-            return admission.FROZEN
-        if not parts.follow(self._basis, kernel_V, pair, rest):
-            return admission.OUTLIER
-        if rest:
-            return admission.UNEXCITED
-        # The window learns only what the filter has just taken, and what that left. Alone it would take the first
-        # samples of a changed stage, which the filter still refuses, and the change would become local for good.
-        if due(pair.now // c.filter_every, c.window_every):
-            return parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)))
-        return admission.LEARNT
+    def _begin(self, step: Step, teaches: bool) -> int:
+        t = self.parts.sample
+        t["y_um"], t["u_V"], t["good"], t["teaches"] = *step, teaches
+        return order.ADVANCE
 
-    def _waits(self, pair: Pair) -> str:
-        """The gate for which the pair is no measure of the model, or ""."""
-        c, intake = self.config, self.parts.intake
+    def _go_on(self, stage: int) -> None:
+        """From ``stage`` on to the end."""
+        parts, intake = self.parts, self.parts.intake
+        while stage != order.DONE:
+            if stage == order.ADVANCED:
+                stage = self._beside_the_smoother()
+            elif stage == order.ROLLED_BACK:
+                parts.roll_back()
+                stage = order.CHECK
+            elif stage == order.DISTRUSTED:
+                stage = order.LEARN
+                if intake.distrust(self.snapshot):
+                    self._go_on_without_readings()
+                    stage = self._end(admission.UNTRUSTED)
+            elif stage == order.FORGET:
+                intake.forget()
+                stage = order.LEARN
+            elif stage == order.HEALING:
+                stage = self._end(parts.window.learn(parts.point, parts.sample["target_V"].item()))
+                parts.note_healing()
+            elif stage == order.ILL:
+                parts.window.begin_healing()
+                parts.note_healing()
+                stage = order.DONE
+            else:
+                stage = self._run(stage)
+
+    def _run(self, stage: int, sample: Sample = _NO_SAMPLE) -> int:
+        parts, home = self.parts, self.parts.home
+        # Of these kinds: others would be compiled for, which takes a minute.
+        given = int(sample.seq), float(sample.t_s), float(sample.u_V), float(sample.y_um)
+        return int(order.go_on(parts.handle, parts.window.handle, home.numbers, home.config, stage, *given))
+
+    def _end(self, outcome: str) -> int:
+        self.parts.sample["outcome"] = OUTCOMES.index(outcome)
+        return order.DONE
+
+    def _beside_the_smoother(self) -> int:
+        """The smoother has made a step beside something rare. Returns the stage at which the sample goes on."""
+        intake, t = self.parts.intake, self.parts.sample
+        intake.go_along(t["u_V"].item())
+        if not t["teaches"]:
+            return order.DONE
+        pair = intake.track.pair()
+        if pair is None:
+            return self._end(admission.SETTLING)
         if intake.missing is not None:
-            missing = intake.recall(pair, self.snapshot, c.filter_every)
+            missing = intake.recall(pair, self.snapshot, self.config.filter_every)
             self._cache = None
             if missing:
-                return admission.GAP
-        if admission.settling(c.admission, intake.gates):
-            return admission.SETTLING
-        return "" if pair.good else admission.GLITCH
-
-    def _check(self, pair: Pair, target_V: float, saturated: bool) -> str:
-        """Check the sensor. Returns the gate that forbids learning, or ""."""
-        parts, intake = self.parts, self.parts.intake
-        kernel_V = pair.u_V - target_V
-        p_V = kernel_V + float(self._basis.dot(parts.references[0]))
-        if saturated or not intake.follow(pair, p_V, parts.check_s):
-            return ""
-        if not intake.distrust(self.snapshot):
-            return ""
-        self._go_on_without_readings()
-        return admission.UNTRUSTED
+                return self._end(admission.GAP)
+        return order.TEACH
 
     def _go_on_without_readings(self) -> None:
         """The readings are on trial from now on."""
@@ -619,10 +550,14 @@ class Learner:
             self._cache = self.parts.model()
         return self._cache
 
+    def look_again(self) -> None:
+        """The state may have changed in a fleet: the next snapshot is a new one."""
+        self._cache = None
+
     def moving(self) -> MovingPart | None:
         """What has moved since the last snapshot; None where something else than the learnt model is served."""
         parts, intake, j = self.parts, self.parts.intake, self.parts.judgement
-        if j.fallback or intake.track is None or self.trouble or self.distrusts:
+        if j.fallback or not intake.track.begun or self.trouble or self.distrusts:
             return None
         frame = intake.served
         return MovingPart(
@@ -636,7 +571,7 @@ class Learner:
         It is of the smoother's instant, ``lag`` samples before ``seq``.
         """
         track = self.parts.intake.track
-        return self.base.rest_memory(self.base.features.y_rest_um) if track is None else track.memory.copy()
+        return track.memory.copy() if track.begun else self.base.rest_memory(self.base.features.y_rest_um)
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """(m,) hysteresis memory with which ``model``, a snapshot of this learner, goes on from the last sample.
@@ -647,7 +582,7 @@ class Learner:
         """
         intake = self.parts.intake
         # Of two memories in one frame, the learner's has not followed untrusted readings.
-        if intake.track is None or (smoothed and intake.holds) or not isinstance(model, LssvmInverse):
+        if not intake.track.begun or (smoothed and intake.holds) or not isinstance(model, LssvmInverse):
             return None
         frozen = model.features != intake.served and model.features == self.base.features
         if smoothed:
@@ -678,16 +613,16 @@ class Learner:
 
     def freeze(self) -> None:
         """Stop learning. Samples still advance smoother, memory and error statistics."""
-        self._frozen = True
+        self.parts.frozen = True
 
     def thaw(self) -> None:
         """Learn again."""
-        self._frozen = False
+        self.parts.frozen = False
 
     @property
     def frozen(self) -> bool:
         """Whether learning is stopped."""
-        return self._frozen
+        return self.parts.frozen
 
     # ---- hyper-parameters from elsewhere
 
@@ -702,7 +637,10 @@ class Learner:
         Atomic, and without a jump of the output; refused unless it predicts the newest samples better.
         """
         reason = self.parts.adopt(hyper)
-        self.parts.events["adoptions_refused" if reason else "adoptions"] += 1
+        if reason:
+            self.parts.adoptions_refused += 1
+        else:
+            self.parts.adoptions += 1
         if not reason:
             self._cache = None
         return reason
@@ -727,10 +665,10 @@ class Learner:
             "jumps": parts.intake.jumps,
             "jumps_undone": parts.intake.undone,
             "trials": parts.intake.trials,
-            **parts.events,
+            **{name: getattr(parts, name) for name in EVENTS},
         }
         return {
-            **parts.counters,
+            **dict(zip(OUTCOMES, parts.counters.tolist(), strict=True)),
             **events,
             "filter_updates": drift.updates,
             "bursts": drift.bursts,
@@ -765,7 +703,7 @@ class Learner:
             "window_cholesky": float(parts.window.form == "cholesky"),
             "valid": float(j.valid),
             "fallback": float(j.fallback),
-            "frozen": float(self._frozen),
+            "frozen": float(parts.frozen),
             "lag_s": intake.smoother.config.lag * base.dt_s,
             "window_y_um": window_y_um.tolist(),
             "window_v_um_per_s": window_v_um_per_s.tolist(),
@@ -778,15 +716,11 @@ class Learner:
     def state_dict(self) -> StateDict:
         """The whole state; ``from_state`` continues from it with the same result to the last bit."""
         made_from = joined({"base": self.base.state_dict(), "config": self.config.state_dict()})
-        return {**made_from, **self.parts.state_dict(), "frozen": self._frozen}
+        return {**made_from, **self.parts.state_dict()}
 
-    def resume(self, state: StateDict, arrays: bool = True) -> None:
-        """Continue from the changing part of a state; ``arrays=False``: the solver's arrays hold theirs already."""
-        changing = {n: value for n, value in state.items() if not n.startswith(("base.", "config.", "frozen"))}
-        if type(state.get("frozen")) is not bool:
-            raise Refused("frozen", repr(state.get("frozen"))[:80], "a truth value")
-        self.parts.restore(changing, arrays)
-        self._frozen = state["frozen"]
+    def resume(self, state: StateDict) -> None:
+        """Continue from the changing part of a state."""
+        self.parts.restore({n: value for n, value in state.items() if not n.startswith(("base.", "config."))})
         self._cache = None
 
     def restored(self, state: StateDict) -> Learner:
@@ -796,11 +730,10 @@ class Learner:
     @classmethod
     def from_state(cls, state: StateDict) -> Learner:
         """Inverse of ``state_dict``. Raises ModelFileError where entries are missing or do not fit together."""
-        made = cls.__new__(cls)
         with within("base."):
             base = LssvmInverse.from_state(under("base.", state))
         try:
-            made._begin(base, LearnerConfig.from_state(under("config.", state)))
+            made = cls(base, LearnerConfig.from_state(under("config.", state)))
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f"learner state: setting missing or damaged: {error}; start from the model") from error
         made.resume(state)

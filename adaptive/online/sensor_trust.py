@@ -38,7 +38,7 @@ from dehyst.adaptive.compiled import shared
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.glitch_or_jump import Circumstances, tolerance_um
 from dehyst.adaptive.online.track import Reckoning, drive_V
-from dehyst.adaptive.state import Entry
+from dehyst.adaptive.state import Entry, Numbers
 from dehyst.adaptive.types import FloatArray
 
 # --- The check that always runs.
@@ -60,9 +60,9 @@ CREEP_PER_S = 0.05
 ENOUGH_SLOPE = 6.0
 #: Slopes p/u that a stage can have, with hysteresis and a wrong model allowed for; smallest squared correlation.
 FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
-#: Slopes that are a fault after ``ENOUGH`` steps already, if so much of the steps lies on a line, and p - u changes
-#: faster than a stage can drift.
-FAR_SLOPES, FAR_STRAIGHT = (0.5, 2.0), 0.9
+#: Slopes beyond this factor, up or down, that are a fault after ``ENOUGH`` steps already, if so much of the steps lies
+#: on a line, and p - u changes faster than a stage can drift.
+FAR_SLOPE, FAR_STRAIGHT = 2.0, 0.9
 #: The stage itself drifts if p - u changes at a rate whose standard deviation is below this share of its mean; a step
 #: follows if p differs from u by no more than this share. Forgetting factor of the rate for each step.
 STEADY, FORGET_DRIFT = 0.35, 0.5
@@ -73,8 +73,7 @@ STEP_STILL, STILL_STEPS = 0.2, 4
 CONFIRMED = 10
 
 
-@dataclass(slots=True)
-class Following:
+class Following(Numbers):
     """Check of readings that pass the gates: sums over the last steps.
 
     Each step is a vector (u, p), scaled so that its larger component is 1 or -1.
@@ -183,7 +182,7 @@ def _shows_fault(sums: Following, follows: bool, fastest_V_per_s: float) -> bool
         return sums.pp <= FOLLOWING_SLOPES[1] ** 2 * sums.uu
     if follows or FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]:
         return False
-    far = straight >= FAR_STRAIGHT and not FAR_SLOPES[0] <= slope <= FAR_SLOPES[1]
+    far = straight >= FAR_STRAIGHT and not 1.0 / FAR_SLOPE <= slope <= FAR_SLOPE
     return sums.count >= ENOUGH_SLOPE or (far and abs(sums.drift_V_per_s) > fastest_V_per_s)
 
 
@@ -251,8 +250,8 @@ STILL = 0.15
 #: one.
 NAMED, RENAMED = 3, 24
 #: A slope that differs from 1 by more than this is a change of gain. Two results agree if slopes, and positions as a
-#: share of the range, differ by less than the second value.
-GAIN_STEP, AGREE = 0.02, 0.02
+#: share of the range, differ by less.
+AGREE = 0.02
 #: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
@@ -440,7 +439,7 @@ class Trial:
 
     def _following(self, s: Slope, off_um: float, at_um: float, in_place: bool, now: Circumstances) -> Decision:
         """Decision for readings that follow, with the line ``s`` and the mean distance ``off_um`` at ``at_um``."""
-        same_gain = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
+        same_gain = abs(s.slope - 1.0) <= AGREE + 4.0 * s.std
         if same_gain and in_place:
             return Decision(Outcome.SAME, credit=1)
         slope, shift_um = (1.0, off_um) if same_gain else (s.slope, s.constant)

@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 
 from dehyst.adaptive.compiled import compiled
-from dehyst.adaptive.features import FeatureMap, advance, advance_both, fill
+from dehyst.adaptive.features import FeatureMap, advance, fill
 from dehyst.adaptive.inverse_model import LssvmInverse, mean_of, track_memory, unpacked, voltage_of
-from dehyst.adaptive.smoothing import FixedLagSmoother, SmootherState
-from dehyst.adaptive.state import Entry
-from dehyst.adaptive.types import BoolArray, FloatArray, IntArray
+from dehyst.adaptive.online.row import Row
+from dehyst.adaptive.state import Entry, Numbers
+from dehyst.adaptive.types import FloatArray, IntArray
 
 # --- Dead reckoning: the place of the stage from the voltage alone, by solving the inverse model for the displacement.
 #
@@ -96,8 +96,7 @@ class Reckoning:
         made.numbers[[_SLOPE, _LINE]] = slope, u_before_V - slope * y
         # The first step is the model's way from the measured place to its own.
         off = np.array([made.advance(float(u), anew=i == 0) for i, u in enumerate(u_V[: y_um.size])])
-        for u in u_V[y_um.size :]:
-            made.advance(float(u))
+        made.advance_all(u_V[y_um.size :])
         if off.size:
             # The middle one: some of these readings may have rung, or been wrong, already.
             made.numbers[_OFF] = float(np.median(y_um - off))
@@ -179,6 +178,19 @@ class Reckoning:
         constants, counts = self.model.packed
         _step(u_V, f.dt_s, self.range_um, anew, self.memory, self.numbers, constants, counts)
         return self.y_um
+
+    def advance_all(self, u_V: FloatArray) -> None:
+        """Advance by a sample with each of (n,) voltages."""
+        constants, counts = self.model.packed
+        _steps(
+            np.asarray(u_V, dtype=np.float64),
+            self.model.dt_s,
+            self.range_um,
+            self.memory,
+            self.numbers,
+            constants,
+            counts,
+        )
 
 
 def drive_V(model: LssvmInverse) -> float:
@@ -266,6 +278,14 @@ def _step(
     n[_WAY] += abs(held - before)
     n[_Y], n[_U] = held, u
     advance(held, memory, m)
+
+
+@compiled
+def _steps(
+    u: FloatArray, dt: float, span: float, memory: FloatArray, n: FloatArray, constants: FloatArray, counts: IntArray
+) -> None:  # pragma: no cover - compiled
+    for i in range(u.shape[0]):
+        _step(u[i], dt, span, False, memory, n, constants, counts)
 
 
 # --- The hysteresis memory after a gap: what the stage may have done while its samples were missing.
@@ -502,7 +522,7 @@ class Step(NamedTuple):
 class Pair(NamedTuple):
     """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), and its voltage, V, smoothed alike.
 
-    rates : of that voltage, V/s and V/s². applied_V : the voltages that were applied at that instant and just before
+    applied_V : the voltages that were applied at that instant and just before
     it, V. good : whether the readings at that instant and before it are good.
     """
 
@@ -511,7 +531,6 @@ class Pair(NamedTuple):
     v_um_per_s: float
     a_um_per_s2: float
     u_V: float
-    rates: tuple[float, float]
     applied_V: tuple[float, float]
     good: bool
 
@@ -562,143 +581,130 @@ class Past:
         return cls(motion, reckoning.u_V, u_V, place_um, reckoning.memory.copy(), [])
 
 
-@dataclass(slots=True)
-class Track:
-    """A track with its state; ``base`` is the feature map of the model that the learner started from.
+class Track(Numbers):
+    """A track: its part of a row; ``base`` is the feature map of the model that the learner started from.
 
-    ``features`` and ``served`` differ for a lag after a jump. ``frozen_memory`` knows of no jump.
-    ``drive`` smooths the voltage as ``state`` does the motion: what the smoother takes from the motion is then missing
-    in both, so that turns, steps and fast motion teach what slow motion does.
+    The frames of ``features`` and ``served`` differ for a lag after a jump. ``frozen_memory`` knows of no jump. The
+    voltage is smoothed as the motion is: what the smoother takes from the motion is then missing in both, so that
+    turns, steps and fast motion teach what slow motion does.
     """
 
-    smoother: FixedLagSmoother
-    base: FeatureMap
-    state: Annotated[SmootherState, Entry("state of the smoother", name="smoother")]
-    drive: Annotated[SmootherState, Entry("state of the smoother of the voltage")]
+    begun: Annotated[bool, Entry("whether there has been a reading")]
+    count: Annotated[int, Entry("steps of the smoother", low=0)]
+    smooth_V: Annotated[float, Entry("smoothed voltage of the last instant", "V")]
+    switch: Annotated[int, Entry("the smoother's count until which the two frames differ", low=0)]
+    jumps: Annotated[bool, Entry("whether they differ")]
+    x: Annotated[FloatArray, Entry("predicted state of the smoother, in sample units", "µm", "order")]
+    ring: Annotated[FloatArray, Entry("innovation and prediction of each step", "µm", "taps,4")]
+    drive_x: Annotated[FloatArray, Entry("the same of the smoother of the voltage", "V", "order")]
+    drive_ring: Annotated[FloatArray, Entry("the same", "V", "taps,4")]
     u_V: Annotated[FloatArray, Entry("ring of voltages by the smoother's count", "V", "slots", finite=False)]
     y_um: Annotated[FloatArray, Entry("ring of readings by the smoother's count", "µm", "slots", finite=False)]
-    good: Annotated[BoolArray, Entry("ring of which readings are good", "", "slots")]
-    features: Annotated[FeatureMap, Entry("feature map of the instant that is being learnt")]
-    served: Annotated[FeatureMap, Entry("feature map to serve with")]
+    good: Annotated[IntArray, Entry("ring of which readings are good", "", "slots", low=0, high=1)]
+    instant: Annotated[FloatArray, Entry("last smoothed motion, lag samples old", "µm, µm/s, µm/s²", "3")]
+    rates: Annotated[FloatArray, Entry("rates of the smoothed voltage", "V/s, V/s²", "2")]
+    frames: Annotated[
+        FloatArray,
+        Entry("frames of the instant that is learnt, and that is served: offset, 1/gain, dead band, gain",
+              "µm, , µm, ", "2,4"),
+    ]  # fmt: skip
     memory: Annotated[FloatArray, Entry("hysteresis memory in the learner's frame", "µm", "m")]
     frozen_memory: Annotated[FloatArray, Entry("hysteresis memory in the identified frame", "µm", "m")]
-    motion: Annotated[
-        Motion | None, Entry("last smoothed motion, lag samples old, if any", "µm, µm/s, µm/s²", "3|0")
-    ] = None
-    smooth_V: Annotated[float, Entry("smoothed voltage of that motion", "V")] = 0.0
-    rates: Annotated[tuple[float, float], Entry("its rates", "V/s, V/s²", "2")] = (0.0, 0.0)
-    switch: Annotated[int, Entry("the smoother's count until which the two maps differ", low=0)] = 0
 
-    def check_state(self) -> None:
-        """Raise ValueError where a map has other sizes than that of the model. Equal maps become one object."""
-        for name in ("features", "served"):
-            getattr(self, name).check_like(self.base)
-        if self.features == self.served:
-            self.features = self.served
+    def __init__(self, record: Any, row: Row, base: FeatureMap, lag: int) -> None:
+        self.record, self.base, self.lag = record, base, lag
+        self.x, self.ring, self.drive_x, self.drive_ring = row.x, row.ring, row.drive_x, row.drive_ring
+        self.u_V, self.y_um, self.good, self.rates = row.voltages, row.readings, row.good, row.rates
+        self.instant, self.frames, self.scale = row.motion, row.frames, row.scale
+        self.memory, self.frozen_memory = row.memory, row.frozen_memory
+        self._maps = [base, base]
+        self.enter(base)
 
-    @classmethod
-    def begin(cls, smoother: FixedLagSmoother, base: FeatureMap, served: FeatureMap, y_um: float) -> Track:
-        """A stage that came to rest at ``y_um`` in one stroke."""
-        slots = smoother.config.lag + 2
-        rings = np.zeros(slots), np.zeros(slots), np.zeros(slots, dtype=np.bool_)
-        memories = served.rest_memory(y_um), base.rest_memory(y_um)
-        state, drive = smoother.initial_state(y_um), smoother.initial_state(0.0)
-        return cls(smoother, base, state, drive, *rings, served, served, *memories)
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where a frame is none."""
+        for offset_um, inverse, _, gain in values["frames"]:
+            self.base.in_frame(gain, offset_um)
+            if inverse != 1.0 / gain:
+                raise ValueError(f"frames: got a gain of {gain} and {inverse} as one over it")
 
-    def restart(self, y_um: float) -> None:
-        """Begin smoothing anew; the hysteresis memory follows to where the stage now is.
+    def begin(self, y_um: float) -> None:
+        """A stage that came to rest at ``y_um`` in one stroke; after the first time, begin smoothing anew.
 
-        Over the readings that were not smoothed yet too: where many samples are lost there is nothing else.
+        The hysteresis memory follows to where the stage now is, over the readings that were not smoothed yet too: where
+        many samples are lost there is nothing else.
         """
-        self.memory, self.frozen_memory = self.memory_now(False), self.memory_now(True)
-        self.state, self.drive = self.smoother.initial_state(y_um), self.smoother.initial_state(0.0)
-        self.good[:] = False
-        self.features, self.motion, self.switch = self.served, None, 0
+        if self.begun:
+            self.memory[:], self.frozen_memory[:] = self.memory_now(False), self.memory_now(True)
+        else:
+            self.memory[:], self.frozen_memory[:] = self.served.rest_memory(y_um), self.base.rest_memory(y_um)
+        self.begun = True
+        self.x[:], self.ring[:], self.drive_x[:], self.drive_ring[:], self.good[:] = 0.0, 0.0, 0.0, 0.0, False
+        self.x[0] = y_um
+        self.frames[0], self.count, self.switch, self.jumps = self.frames[1], 0, 0, False
 
     @property
-    def lag(self) -> int:
-        return self.smoother.config.lag
+    def features(self) -> FeatureMap:
+        """Feature map of the instant that is being learnt."""
+        return self._map(0)
 
     @property
-    def predicted_um(self) -> float:
-        """Where the smoother expects the next reading."""
-        return self.state.x.item(0)
+    def served(self) -> FeatureMap:
+        """Feature map to serve with."""
+        return self._map(1)
+
+    def _map(self, which: int) -> FeatureMap:
+        made, (offset_um, _, _, gain) = self._maps[which], self.frames[which].tolist()
+        if made.offset_um != offset_um or made.gain != gain:
+            made = self._maps[which] = self.base.in_frame(gain, offset_um)
+        return made
 
     @property
-    def rates_now(self) -> tuple[float, float]:
-        """Rates of the voltage as the smoother expects them at the next sample, V/s and V/s²."""
-        _, slope, bend = self.smoother.scale.tolist()
-        return self.drive.x.item(1) * slope, self.drive.x.item(2) * bend
+    def motion(self) -> Motion | None:
+        """Last smoothed motion (µm, µm/s, µm/s²), ``lag`` samples old, if any."""
+        if self.count <= self.lag:
+            return None
+        y, v, a = self.instant.tolist()
+        return y, v, a
 
     @property
     def last_um(self) -> float:
         """The last reading that was smoothed."""
-        return self.y_um.item((self.state.count - 1) % self.y_um.shape[0])
-
-    def copy(self) -> Track:
-        """An independent copy."""
-        return Track(
-            self.smoother, self.base, self.state.copy(), self.drive.copy(), self.u_V.copy(), self.y_um.copy(),
-            self.good.copy(), self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion,
-            self.smooth_V, self.rates, self.switch,
-        )  # fmt: skip
+        return self.y_um.item((self.count - 1) % self.y_um.shape[0])
 
     def move(self, served: FeatureMap, slope: float, shift_um: float) -> None:
         """A jump: the smoother goes on at another place, y <- slope y + shift, in a new frame."""
-        self.state.move(slope, shift_um)
-        self.served, self.switch = served, self.state.count + self.lag
+        self.x *= slope
+        self.x[0] += shift_um
+        self._put(1, served)
+        self.switch, self.jumps = self.count + self.lag, True
 
     def enter(self, frame: FeatureMap) -> None:
         """Learn and serve in another frame from now on, where no jump is under way."""
-        self.features = self.served = frame
+        self._put(0, frame)
+        self._put(1, frame)
+        self.jumps = False
+
+    def _put(self, which: int, frame: FeatureMap) -> None:
+        self.frames[which] = frame.offset_um, 1.0 / frame.gain, frame.dead_um, frame.gain
 
     def to_base(self) -> None:
         """Return to the frame of ``base`` and the memory tracked in it."""
         self.enter(self.base)
-        self.memory, self.switch = self.frozen_memory.copy(), 0
-
-    def creep(self, by_um: float) -> None:
-        """The frame's offset moves, µm, under a motion that stays. Nothing where the frame is about to jump."""
-        if self.features is self.served:
-            self.enter(replace(self.served, offset_um=self.served.offset_um + by_um))
-
-    def advance(self, step: Step) -> tuple[Pair | None, bool]:
-        """One step: the pair of ``lag`` samples ago, None before there is one; whether it is the first after a jump."""
-        state, slots = self.state, self.u_V.shape[0]
-        slot = state.count % slots
-        self.y_um[slot], self.u_V[slot], self.good[slot] = step
-        if not state.count:
-            self.drive.x[0] = step.u_V
-        drive = self.smoother.step(self.drive, step.u_V)
-        self.motion = self.smoother.step(state, step.y_um)
-        if self.motion is None or drive is None:
-            return None, False
-        self.smooth_V, self.rates = drive[0], drive[1:]
-        switched = self.features is not self.served and state.count > self.switch
-        if switched:
-            self.features = self.served
-        if self.features is self.base:
-            # No jump yet: one call for both memories costs little more than one for the first.
-            advance_both(self.motion[0], self.memory, self.frozen_memory, self.base.arrays)
-        else:
-            self.features.advance(self.motion[0], self.memory)
-            self.base.advance(self.motion[0], self.frozen_memory)
-        return self.pair(), switched
+        self.memory[:], self.switch = self.frozen_memory, 0
 
     def pair(self) -> Pair | None:
         """What the smoothed instant teaches; None before there is one."""
-        if self.motion is None:
+        motion, slots = self.motion, self.u_V.shape[0]
+        if motion is None:
             return None
-        slots = self.u_V.shape[0]
-        now = self.state.count - 1 - self.lag
+        now = self.count - 1 - self.lag
         at, before = now % slots, (now - 1) % slots
-        # As bytes: numpy's own "all" of so few costs as much as a step of the smoother.
-        good = 0 not in self.good.tobytes() or bool(self.good[at] and self.good[before])
-        return Pair(now, *self.motion, self.smooth_V, self.rates, (self.u_V.item(at), self.u_V.item(before)), good)
+        good = bool(self.good[at] and self.good[before])
+        return Pair(now, *motion, self.smooth_V, (self.u_V.item(at), self.u_V.item(before)), good)
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""
-        self.memory, self.frozen_memory = memory.copy(), self.served.memory_in(self.base, memory)
+        self.memory[:], self.frozen_memory[:] = memory, self.served.memory_in(self.base, memory)
 
     def since_motion(self) -> tuple[Motion, float, FloatArray, FloatArray]:
         """The last smoothed motion, in the frame that is served, its voltage, and (lag,) voltages and readings since.
@@ -707,15 +713,15 @@ class Track:
         """
         assert self.motion is not None
         slots = self.u_V.shape[0]
-        numbers = np.arange(self.state.count - self.lag, self.state.count)
+        numbers = np.arange(self.count - self.lag, self.count)
         past = numbers % slots
-        u_before_V = float(self.u_V[(self.state.count - self.lag - 1) % slots])
+        u_before_V = float(self.u_V[(self.count - self.lag - 1) % slots])
         f, g = self.features, self.served
         y, v, a = self.motion
         # Just after a jump the smoothed instants are still in the frame from before it.
         ratio = g.gain / f.gain
         y_um = self.y_um[past]
-        if f is not g:
+        if self.jumps:
             early = numbers < self.switch - self.lag
             y_um[early] = g.offset_um + ratio * (y_um[early] - f.offset_um)
         motion = g.offset_um + ratio * (y - f.offset_um), ratio * v, ratio * a
@@ -726,9 +732,8 @@ class Track:
 
         ``frozen`` : the one in the frame of ``base``.
         """
-        end, slots = self.state.count, self.u_V.shape[0]
-        past = np.arange(max(end - self.lag, 0), end)
-        y_um = self.y_um[past % slots]
+        past = np.arange(max(self.count - self.lag, 0), self.count)
+        y_um = self.y_um[past % self.y_um.shape[0]]
         if frozen:
             after = self.frozen_memory.copy()
             track_memory(y_um, after, self.base.arrays)

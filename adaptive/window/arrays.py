@@ -183,22 +183,20 @@ def take_over(arrays: WindowArrays, source: WindowArrays) -> None:
     forget_kept(arrays)
 
 
-# --- The handle of a window: one array in place of all of them.
-
-_FIELDS = len(WindowArrays._fields)
+# --- The handle of arrays: one array in place of all of them.
 
 
-def handle_of(arrays: WindowArrays) -> IntArray:
-    """(39,) addresses of all arrays, then two sizes of each. Valid only while these arrays live: keep both together.
+def handle_of(arrays: Any) -> IntArray:
+    """(3 n,) address and two sizes of each of n arrays, a tuple with names. Keep both together: only these are valid.
 
-    Raises TypeError where an array is not C-ordered float64 or int64, as `allocate` makes them.
+    Raises TypeError where an array is not C-ordered float64 or int64, of one or two dimensions.
     """
-    handle = np.zeros(3 * _FIELDS, dtype=np.int64)
+    handle = np.zeros(3 * len(arrays), dtype=np.int64)
     for i, array in enumerate(arrays):
-        if not array.flags.c_contiguous or array.dtype not in (np.float64, np.int64):
-            raise TypeError(f"{WindowArrays._fields[i]}: a C-ordered array of float64 or int64 is needed")
-        handle[i] = array.ctypes.data
-        handle[_FIELDS + 2 * i : _FIELDS + 2 * i + array.ndim] = array.shape
+        if not array.flags.c_contiguous or array.dtype not in (np.float64, np.int64) or array.ndim > 2:
+            raise TypeError(f"{arrays._fields[i]}: a C-ordered array of float64 or int64 is needed")
+        handle[3 * i] = array.ctypes.data
+        handle[3 * i + 1 : 3 * i + 1 + array.ndim] = array.shape
     return handle
 
 
@@ -213,27 +211,30 @@ _pointer: Any = intrinsic(_to_pointer)
 
 
 @compiled
-def _matrix(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i], h[_FIELDS + 2 * i + 1]), np.float64)
+def matrix_of(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
+    """Array i of a handle, of two dimensions."""
+    return carray(_pointer(h[3 * i]), (h[3 * i + 1], h[3 * i + 2]), np.float64)
 
 
 @compiled
-def _vector(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.float64)
+def vector_of(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
+    """Array i of a handle, of one dimension."""
+    return carray(_pointer(h[3 * i]), (h[3 * i + 1],), np.float64)
 
 
 @compiled
-def _integers(h: IntArray, i: int) -> IntArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.int64)
+def integers_of(h: IntArray, i: int) -> IntArray:  # pragma: no cover - compiled
+    """Array i of a handle, of integers."""
+    return carray(_pointer(h[3 * i]), (h[3 * i + 1],), np.int64)
 
 
 @compiled
 def arrays_of(h: IntArray) -> WindowArrays:  # pragma: no cover - compiled
     """The window behind a handle, in the order of `WindowArrays`."""
     return WindowArrays(
-        _matrix(h, 0), _matrix(h, 1), _matrix(h, 2), _matrix(h, 3), _vector(h, 4), _vector(h, 5), _matrix(h, 6),
-        _matrix(h, 7), _vector(h, 8), _integers(h, 9), _integers(h, 10), _vector(h, 11),
-        _vector(h, 12),
+        matrix_of(h, 0), matrix_of(h, 1), matrix_of(h, 2), matrix_of(h, 3), vector_of(h, 4), vector_of(h, 5),
+        matrix_of(h, 6), matrix_of(h, 7), vector_of(h, 8), integers_of(h, 9), integers_of(h, 10), vector_of(h, 11),
+        vector_of(h, 12),
     )  # fmt: skip
 
 

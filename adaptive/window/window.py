@@ -202,6 +202,11 @@ class Window:
         self._arrays = arrays
         self._handle = ws.handle_of(arrays)
 
+    @property
+    def handle(self) -> IntArray:
+        """The handle of ``arrays``."""
+        return self._handle
+
     def __len__(self) -> int:
         return int(self._arrays.C[ws.COUNT])
 

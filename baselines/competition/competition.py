@@ -415,11 +415,11 @@ class Competition:
         """Take the instant that the favourite has just smoothed, if there is one; none while it holds readings."""
         parts = self._smooths.parts
         gates, track = parts.intake.gates, parts.intake.track
-        pair = None if track is None else track.pair()
-        if track is None or pair is None or pair.now == self._last:
+        pair = track.pair()
+        if pair is None or pair.now == self._last:
             return
         self._last = pair.now
-        moves = (track.state.count - gates.moved) * self._dt_s <= parts.config.admission.rest_s
+        moves = (track.count - gates.moved) * self._dt_s <= parts.config.admission.rest_s
         scored = verdict in _SCORED and moves
         self._rows.append((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2, pair.u_V, float(scored)))
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from dehyst.adaptive.compiled import compiled
 from dehyst.adaptive.errors import DehystError
 from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig, FleetSnapshot
-from dehyst.adaptive.fleet.step import OUTCOMES
 from dehyst.adaptive.inverse_model import LssvmInverse
+from dehyst.adaptive.online.gates import OUTCOMES
 from dehyst.adaptive.types import BoolArray, FloatArray, MovingPart
 from dehyst.service.answers.guard import Limits, limit
 from dehyst.service.config.learner import learner_config

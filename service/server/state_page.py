@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from dehyst.adaptive.features import FeatureMap
 from dehyst.adaptive.inverse_model import LssvmInverse
-from dehyst.adaptive.online.kernel_window import KernelSolverState
+from dehyst.adaptive.online.kernel_window import KernelState
 from dehyst.adaptive.online.learner import Parts
 from dehyst.adaptive.state import Row, rows
 from dehyst.baselines.bouc_wen.online import BoucWenOnline
@@ -47,7 +47,7 @@ _TABLES: Final[tuple[tuple[str, str, Any], ...]] = (
     ("The watch over the samples", "watch.", SampleWatch),
     ("The choice of the model that is served", "choice.", ModelChoice),
     ("The learner", "learner.", Parts),
-    ("The window of the learner", "learner.window.", KernelSolverState),
+    ("The window of the learner", "learner.window.", KernelState),
     ("A competition", "learner.", Competition),
     ("A model that learns beside the learner: linear", "learner.model.NAME.", LinearOnline),
     ("Prandtl-Ishlinskii", "learner.model.NAME.", MpiOnline),

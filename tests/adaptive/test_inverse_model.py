@@ -37,7 +37,6 @@ def test_equals_its_formula(model: LssvmInverse) -> None:
         basis, kernel, after = one.features.run(y, v, a, one.rest_memory(40.0))
         column = gram(kernel, one.support, one.widths)
         mean = basis @ one.beta + column @ one.alpha
-        assert one.mean(basis[7], kernel[7]) == pytest.approx(mean[7], abs=1e-10)
         if one.anchor.size:
             mean = np.clip(mean, basis @ one.anchor - one.allowed_V, basis @ one.anchor + one.allowed_V)
         variance = np.full(y.size, one.noise_variance)

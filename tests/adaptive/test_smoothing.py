@@ -12,12 +12,10 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.smoothing import (
     FixedLagSmoother,
     SmootherConfig,
-    SmootherState,
     backward_difference,
     smooth_recording,
     zero_phase_lowpass,
 )
-from dehyst.adaptive.state import load, save
 
 DT = 1e-3
 
@@ -49,20 +47,6 @@ def test_equals_rauch_tung_striebel(lag: int, order: int) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
 
 
-def test_steps_equal_run_and_survive_a_round_trip() -> None:
-    smoother = FixedLagSmoother(SmootherConfig.for_rate(DT))
-    y = sine(7.0, 200)[0]
-    state = smoother.initial_state(y[0])
-    out = []
-    for k, value in enumerate(y):
-        out.append(smoother.step(state, value))
-        if k == 77:
-            state = load(SmootherState, save(state), smoother.sizes)
-    lag = smoother.config.lag
-    assert out[:lag] == [None] * lag
-    np.testing.assert_array_equal(np.array(out[lag:]), smoother.run(y)[lag:])
-
-
 def test_follows_motion_better_than_the_raw_reading() -> None:
     y, truth = sine(10.0)
     noisy = y + 5e-3 * np.random.default_rng(1).standard_normal(y.size)
@@ -87,18 +71,6 @@ def test_recording_is_aligned_and_has_no_end_effects_on_a_ramp() -> None:
     got = smooth_recording(y, SmootherConfig.for_rate(DT))
     np.testing.assert_allclose(got[:, 0], y, atol=1e-6)
     np.testing.assert_allclose(got[5:-5, 1], 10.0 / 399 / DT, rtol=1e-3)
-
-
-def test_skipped_samples_run_on_the_prediction() -> None:
-    smoother = FixedLagSmoother(SmootherConfig.for_rate(DT))
-    y, truth = sine(5.0, 400)
-    state = smoother.initial_state(y[0])
-    worst = 0.0
-    for k, value in enumerate(y):
-        got = smoother.skip(state) if k in (250, 251, 252) else smoother.step(state, value)
-        if k > 100 and got is not None:
-            worst = max(worst, abs(got[0] - truth[k - smoother.config.lag, 0]))
-    assert worst < 0.01
 
 
 @settings(max_examples=20, deadline=None)

@@ -25,21 +25,25 @@ from benchmarks.ablation import (
     table,
     worse_rows,
 )
-from dehyst.adaptive.online.learner import Judgement
+from dehyst.adaptive.online.gates import Judgement
 
 
 def test_every_rule_replaces_what_is_there_and_every_variant_has_a_name_of_its_own() -> None:
     for rule in RULES:
         for owner, name, _ in rule.replaces:
             assert name in vars(owner), rule.name
+        for text in rule.source:
+            path = ablation.ROOT / "adaptive" / "online" / f"{text.module}.py"
+            assert path.read_text().count(text.old) == 1, rule.name
+        assert bool(rule.replaces) != bool(rule.source), rule.name
     assert len({variant.name for variant in (*rule_variants(), *field_variants())}) > 80
 
 
 def test_a_copy_of_the_source_holds_the_shifted_constant(tmp_path: Path) -> None:
     variants = {variant.name: variant for variant in constant_variants()}
     assert len(variants) == 2 * len(list(constants())) > 60
-    literal = variants["learner.ROLLBACK_S twice"].literal
-    assert literal is not None
+    (literal,) = variants["step.ROLLBACK_S twice"].edits
+    assert isinstance(literal, ablation.Literal)
     (tmp_path / literal.path).parent.mkdir(parents=True)
     before = (ablation.ROOT / literal.path).read_text().splitlines()
     (tmp_path / literal.path).write_text("\n".join(before))
@@ -50,7 +54,7 @@ def test_a_copy_of_the_source_holds_the_shifted_constant(tmp_path: Path) -> None
         if old != new
     ]
     ((old, new),) = changed
-    value = float(variants["learner.ROLLBACK_S twice"].value)
+    value = float(variants["step.ROLLBACK_S twice"].value)
     assert old.replace(repr(value), repr(2.0 * value)) == new
 
 
@@ -85,8 +89,8 @@ def test_a_row_is_worse_where_its_cases_grow_by_more_than_other_noise_does() -> 
 
 
 @dataclass(frozen=True)
-class FallbackCase:
-    """How long an identified model that is better by a third is not served; and steps that are counted meanwhile."""
+class DoubtCase:
+    """The least size of a jump whose doubt is stated; and steps that are counted meanwhile."""
 
     name: str
     seed: int
@@ -94,16 +98,15 @@ class FallbackCase:
 
     def run(self, noise: int, settings: Settings) -> Numbers:
         rng = np.random.default_rng([self.seed, noise])
-        judgement, waited = Judgement(0.01, 0.01, 0.01, 0.01), 0
-        for _ in range(400):
-            judgement.take(1.5 * rng.normal(), rng.normal(), 1e-3)
-            waited += not judgement.choose(0.0, 1e-3)
-        return {"median": 1.0 + waited, "worst": 1.0, "refused": 0.0, "large_s": 0.0, "accused": False}
+        judgement = Judgement(1.0, 1.0, 1.0, 1.0)
+        judgement.add_doubt(1.0 + 0.1 * rng.random())
+        return {"median": 4.0 / judgement.doubt_V2 if judgement.doubt_V2 else 40.0, "worst": 1.0, "refused": 0.0,
+                "large_s": 0.0, "accused": False}  # fmt: skip
 
 
 @pytest.fixture
 def cases() -> list[ablation.Case]:
-    return [FallbackCase(f"stage {seed}", seed) for seed in range(8)]
+    return [DoubtCase(f"stage {seed}", seed) for seed in range(8)]
 
 
 def rule(name: str) -> Variant:
@@ -113,25 +116,25 @@ def rule(name: str) -> Variant:
 def test_a_rule_that_matters_is_told_from_one_that_does_not(
     cases: list[ablation.Case], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    planned = [rule("fall back to the frozen model"), rule("outliers are refused by the filter")]
+    planned = [rule("doubt after a jump"), rule("jumps move the frame")]
     path, to = tmp_path / "a.jsonl", tmp_path / "table.md"
     results = ablate(cases, planned, jobs=2, path=path, to=to)
-    assert [row.measure for row in results.worse("fall back to the frozen model")] == ["median"]
-    assert "outliers are refused by the filter: the same" in capsys.readouterr().err
+    assert [row.measure for row in results.worse("doubt after a jump")] == ["median"]
+    assert "jumps move the frame: the same" in capsys.readouterr().err
     _, nothing, worth = to.read_text().split("###")
     assert nothing.startswith(" changes nothing, to the last bit (1)")
     assert worth.startswith(" worth its place (1)")
-    assert "| fall back to the frozen model |" in worth
+    assert "| doubt after a jump |" in worth
     assert table(results) + "\n" == to.read_text()
 
-    again = ablate(cases, [*planned, rule("validity")], path=path)
+    again = ablate(cases, [*planned, rule("envelope refuses frames")], path=path)
     said = capsys.readouterr().err
-    assert "fall back" not in said
-    assert "validity: the same" in said
-    assert again.worse("fall back to the frozen model") == results.worse("fall back to the frozen model")
+    assert "doubt" not in said
+    assert "envelope refuses frames: the same" in said
+    assert again.worse("doubt after a jump") == results.worse("doubt after a jump")
 
 
-class DyingCase(FallbackCase):
+class DyingCase(DoubtCase):
     """A case that ends its process when a rule is off."""
 
     def run(self, noise: int, settings: Settings) -> Numbers:
@@ -142,7 +145,7 @@ class DyingCase(FallbackCase):
 
 def test_a_variant_whose_process_ends_has_failed_in_all_cases_left(cases: list[ablation.Case]) -> None:
     dying = [*cases[:2], *(DyingCase(f"dies {seed}", seed) for seed in range(2))]
-    results = ablate(dying, [rule("validity")])
-    ended = [numbers.get("failed") for numbers in results.variants["validity"].values()]
+    results = ablate(dying, [rule("envelope refuses frames")])
+    ended = [numbers.get("failed") for numbers in results.variants["envelope refuses frames"].values()]
     assert ended == [None, None, *["the process ended: 3"] * 2]
-    assert [str(row) for row in results.worse("validity")] == ["intact failed +2"]
+    assert [str(row) for row in results.worse("envelope refuses frames")] == ["intact failed +2"]

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError, ModelFileError
-from dehyst.adaptive.fleet.fleet import Fleet, FleetConfig
-from dehyst.adaptive.fleet.step import NO_SAMPLE, OUTCOMES
+from dehyst.adaptive.fleet.fleet import NO_SAMPLE, Fleet, FleetConfig
 from dehyst.adaptive.identification import IdentifyConfig, identify_lssvm
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.config import LearnerConfig
-from dehyst.adaptive.online.gates import AdmissionConfig
+from dehyst.adaptive.online.gates import OUTCOMES, AdmissionConfig
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.online.sensor_trust import SENSOR_STUCK
 from dehyst.adaptive.types import Sample
@@ -283,12 +282,9 @@ def test_axes_with_kept_samples_and_fifo_equal_single_learners(models: list[Lssv
     assert min(single.counters()["window_steps"] for single in singles) > 20
 
 
-@pytest.mark.parametrize("settle", [0, 50])
-def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse], settle: int) -> None:
-    """Their matrices are written one after the other, and in any case before a step of the axis needs them."""
-    config = LearnerConfig(window=60, admission=AdmissionConfig(settle=settle))
-    # One control trial at a time: one of the axes has its first step within the batch. With ``settle`` 0 a trial can
-    # begin as soon as an axis has a place.
+def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60)
+    # One control trial at a time: one of the axes has its first step within the batch.
     fleet = Fleet([models[0]] * 900, FleetConfig(config, checks=1))
     u, y = samples(700)
     moving = {3: Learner(models[0], config), 899: Learner(models[0], config)}
@@ -306,21 +302,6 @@ def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse], s
         for state in states[2:]:
             assert name not in state or np.array_equal(state[name], begun[name])
     assert min(single.counters()["window_steps"] for single in moving.values()) > 5
-
-
-@pytest.mark.parametrize("settle", [0, 50])
-def test_a_sample_teaches_nothing_while_the_smoother_begins(models: list[LssvmInverse], settle: int) -> None:
-    """Until then the matrices of a window need not be written."""
-    learner = Learner(models[0], LearnerConfig(window=60, admission=AdmissionConfig(settle=settle)))
-    u, y = samples(700)
-    begun = []
-    for k in range(100):
-        begun.append(learner.parts.intake.begins)
-        learner.handle(Sample(k, k * DT, float(u[0, 300 + k]), float(y[0, 300 + k])))
-        if begun[-1]:
-            assert learner.counters()["filter_updates"] == learner.counters()["window_steps"] == 0
-    assert begun[0] is (settle > 0)
-    assert begun[-1] is False
 
 
 def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:

@@ -130,10 +130,9 @@ def test_never_raises_on_data(seq: int, t: float, u: float, y: float) -> None:
     assert gates.check_sample(CONFIG, state(), Sample(seq, t, u, y), DT) in ("", *gates.REASONS)
 
 
-def test_state_round_trip_and_counters() -> None:
+def test_state_round_trip() -> None:
     s = state(since_glitch=2, u_V=1.25)
     assert load(AdmissionState, save(s)) == s
-    assert set(gates.new_counters()) == {gates.LEARNT, gates.PASSED, *gates.REASONS}
 
 
 @pytest.mark.parametrize(

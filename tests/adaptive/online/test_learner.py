@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -355,3 +357,32 @@ def test_a_kernel_part_of_other_motion_is_given_up_and_a_good_one_kept(model: Ls
     assert other.learner.parts.window.share < 0.2 < 0.9 < own.learner.parts.window.share
     assert other.mae(2.0, 3.0) > 10.0 * own.mae(2.0, 3.0)
     assert other.mae(5.0, 6.0) < 2.0 * own.mae(5.0, 6.0)
+
+
+def test_a_missing_reading_leaves_the_others_as_an_anchor(model: LssvmInverse, quiet: Run) -> None:
+    """Only a hold with a wrong reading puts those before the next one in doubt; else dead reckoning would begin again
+    at a place that grows older with every missing reading."""
+    learner, lag = Learner.from_model(model), 0
+    for k in range(1200):
+        missing = k > 1000 and k % 2 == 0
+        y_um = math.nan if missing else float(quiet.y[k]) + 6.0 * (k == 900)
+        learner.handle(Sample(k, k * DT, float(quiet.u[k]), y_um))
+        lag = learner.parts.intake.track.lag
+        if k == 905:
+            assert learner.parts.intake.calm < 10
+    assert learner.counters()["not_finite"] == 99
+    assert learner.parts.intake.calm > 2 * lag
+
+
+def test_a_copy_is_independent_and_goes_on_to_the_last_bit(model: LssvmInverse, quiet: Run) -> None:
+    learner = Learner.from_model(model)
+    rows = [Sample(k, k * DT, float(quiet.u[k]), float(quiet.y[k])) for k in range(900)]
+    for sample in rows[:700]:
+        learner.handle(sample)
+    twins = copy.deepcopy(learner), pickle.loads(pickle.dumps(learner))
+    for one in (learner, *twins):
+        said = [one.handle(sample) for sample in rows[700:]]
+        assert said.count("learnt") > 50
+    for twin in twins:
+        np.testing.assert_array_equal(twin.snapshot().packed[0], learner.snapshot().packed[0])
+        assert twin.counters() == learner.counters()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.features import column
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.tuning.config import RetuneConfig
@@ -160,8 +161,8 @@ def test_starts_fill_the_box_from_what_is_at_work() -> None:
     assert np.array_equal(points[0], here)
     assert np.all((points >= low) & (points <= high))
     # Every eighth of each axis is visited.
-    for column in ((points - low) / (high - low)).T:
-        assert np.histogram(column, 8, (0.0, 1.0))[0].min() >= 4
+    for values in ((points - low) / (high - low)).T:
+        assert np.histogram(values, 8, (0.0, 1.0))[0].min() >= 4
 
 
 def test_what_cannot_be_tuned_is_refused(before: WindowData) -> None:
@@ -217,9 +218,8 @@ def test_better_ones_are_adopted_without_a_jump(state: dict[str, object], record
     assert after.gamma == hyper.gamma
     np.testing.assert_array_equal(after.widths, hyper.widths)
     np.testing.assert_array_equal(learner.parts.filter.beta[1:], beta[1:])
-    basis = np.zeros(before.features.basis_size)
     point = learner.parts.point
-    now, then = after.mean(basis, point) + after.beta[0], before.mean(basis, point) + before.beta[0]
+    now, then = (one.beta[0] + column(one.support, point, one.widths) @ one.alpha for one in (after, before))
     assert now == pytest.approx(then, abs=1e-9)
     np.testing.assert_array_equal(learner.window_data().targets_V, data.targets_V)
     assert learner.counters()["adoptions"] == 1
