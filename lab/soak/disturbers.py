@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -62,7 +63,9 @@ def liar(endpoint: str) -> None:
 
         # Not its own: those would come back to it.
         heard = {"allowed_origin": zenoh.Locality.REMOTE}
-        entities = [session.declare_queryable(key, answer, complete=True) for key in (keys.feedforward, keys.status)]
+        entities: list[Any] = [
+            session.declare_queryable(key, answer, complete=True) for key in (keys.feedforward, keys.status)
+        ]
         entities += [session.declare_subscriber(key, repeat, **heard) for key in (keys.sample, keys.champion_delta)]
         print("ready", flush=True)
         stop.wait()
