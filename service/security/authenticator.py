@@ -231,12 +231,12 @@ class Heard:
 
     Attributes
     ----------
-    refused : number of messages without a right tag. old : number of repeated ones. is_unknown : whether the last
-    message was left out because its sender is not that of the last reply; then query, and `meet` who replies.
+    refused : number of messages without a right tag. is_unknown : whether the last message was left out because its
+    sender is not that of the last reply; then query, and `meet` who replies.
     """
 
     def __init__(self, authenticator: Authenticator, key: str) -> None:
-        self.refused = self.old = 0
+        self.refused = 0
         self.is_unknown = False
         self._by, self._key = authenticator, key
         self._sender, self._rising = b"", Rising()
@@ -256,8 +256,6 @@ class Heard:
             self.refused += 1
         elif not self._by or (not self.is_unknown and self._rising.take(signed.stamp)):
             return signed.payload
-        elif not self.is_unknown:
-            self.old += 1
         return None
 
 
