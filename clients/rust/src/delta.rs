@@ -57,6 +57,9 @@ impl Changes {
     /// A payload of kind 6, or of kind 7. With `Taken` the snapshot to use.
     pub fn take(&mut self, payload: &[u8]) -> Result<(Update, Option<Snapshot>)> {
         if payload.get(1) != Some(&DELTA) {
+            if crc32(payload) == self.base {
+                return Ok((Update::Taken, None)); // fetched late: the changes since are not undone
+            }
             let left = std::mem::replace(self, Changes::new(payload)?).left.filter(|left| left.base == self.base);
             let newest = left.map_or_else(|| Ok(self.whole.clone()), |left| self.whole.moved(&left))?;
             return Ok((Update::Taken, Some(newest)));
