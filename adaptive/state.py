@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import types
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
 from functools import cache
@@ -522,37 +522,36 @@ def _words(value: Any) -> str:
 
 
 class Row(NamedTuple):
-    """An entry for people. ``shape`` : "" for a number or a text."""
+    """An entry for people: its meaning with shape, unit and range."""
 
     name: str
-    shape: str
-    unit: str
-    range: str
     meaning: str
 
 
-def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Row]:
-    """The entries that ``save`` writes of a record of ``cls``, in its order; without those of records in ``apart``."""
+def rows(cls: Any, prefix: str = "", listed: dict[Any, str] | None = None) -> Iterator[Row]:
+    """The entries that ``save`` writes of a record of ``cls``, in its order.
+
+    ``listed`` : where the entries of a record are, "" for elsewhere. They are not listed again; new ones are added.
+    None: all are listed.
+    """
     for slot in _slots(cls):
-        entry, name, inner = slot.entry, prefix + slot.name, prefix
+        entry, name, one = slot.entry, prefix + slot.name, slot.of in _NUMBERS and slot.kind in ("number", "named")
         if slot.kind in ("record", "part"):
+            inner = f"{name}." if slot.name else prefix
+            first = listed.setdefault(slot.of, inner) if slot.name and listed is not None else inner
             if slot.name:
-                inner = f"{name}."
-                yield Row(inner, "", "", "may be absent" if slot.optional else "", entry.meaning)
-            if slot.of not in apart:
-                yield from rows(slot.of, inner, apart)
+                told = (entry.meaning, "may be absent" * slot.optional, f"entries as in {first}" * (first != inner))
+                yield Row(inner, ", ".join(filter(None, told)))
+            if first == inner:
+                yield from rows(slot.of, inner, listed)
             continue
-        limits = [_range(entry), "" if entry.finite else "or not finite"]
         if slot.kind == "named":
-            names = entry.among if entry.among and not slot.name else ("NAME",)
-            name = f"{name}.NAME" if slot.name else prefix + ", ".join(names)
-        elif slot.of is bool or slot.of == np.dtype(bool):
-            limits = ["a truth value"]
+            name = f"{name}.NAME" if slot.name else prefix + ", ".join(entry.among or ("NAME",))
+        values = [_range(entry), "" if entry.finite else "or not finite"]
+        if slot.of is bool or slot.of == np.dtype(bool):
+            values = ["a truth value"]
         elif slot.of is str:
-            limits = [", ".join(word for word in entry.among if word) or "a text"]
-        shape = (
-            ""
-            if slot.of in _NUMBERS and slot.kind in ("number", "named")
-            else " or ".join(str(",".join(map(str, s))) for s in slot.shapes)
-        )
-        yield Row(name, shape, entry.unit, ", ".join(filter(None, limits)), entry.meaning)
+            values = [", ".join(filter(None, entry.among)) or "a text"]
+        shape = "" if one else f"({' or '.join(','.join(map(str, shape)) for shape in slot.shapes)})"
+        about = ", ".join(filter(None, (shape, entry.unit, *values)))
+        yield Row(name, f"{entry.meaning} [{about}]" if about else entry.meaning)

@@ -11,8 +11,11 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import zenoh
 
 from benchmarks.forged_states import edited, make_axis, recording
 from dehyst.adaptive.errors import InputError, ModelFileError
@@ -124,6 +127,20 @@ def _owners() -> Target:
     return target
 
 
+def _signed() -> Target:
+    """An attachment, then a payload: as a publication, a reply and a request. Without the key none is believed."""
+    by = Authenticator(b"0123456789abcdef")
+
+    def target(data: bytes) -> None:
+        attached, payload = zenoh.ZBytes(data[:32]), zenoh.ZBytes(data[32:])
+        said: Any = SimpleNamespace(key_expr="k", parameters="", attachment=attached, payload=payload)
+        answer = by.question(payload=data[32:]).answer(said)
+        if by.heard(said, "k") is not None or answer is not None or by.is_asked_by_ours(said, "k"):
+            raise AssertionError("a message without a right tag was believed")
+
+    return target
+
+
 def _state() -> Target:
     """A valid state with entries replaced: an axis refuses it, or takes it and learns and answers from it."""
     axis = make_axis(alone=True)
@@ -165,6 +182,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "state": _state,
     "claim": _claims,
     "owner": _owners,
+    "signed": _signed,
     "fault": lambda: _refusing(decode_fault),
     "operate": lambda: _refusing(decode_request),
     "error": lambda: _refusing(error_from_json),
@@ -214,6 +232,7 @@ def seeds(target: str) -> list[bytes]:
             b"1/0123456789abcdef/2/lab1",
         ],
         "claim": [b"3/i-rogue/00ff00ff00ff00ff00ff00ff00ff00ff", b"999999999/i-rogue"],
+        "signed": [Authenticator(bytes(16)).published("k", b"{}") or b"", bytes(40), b""],
         "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],
         "operate": [
             encode_request(Request("rollback", "alice", {"checkpoint": 3})),

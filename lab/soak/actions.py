@@ -56,6 +56,7 @@ class FaultActions:
             "stop_primary": lambda _: self._stop_primary(),
             "kill_viewer": lambda _: self._kill("viewer", soak.start_viewer),
             "slow_viewer": lambda _: self._disturb("slow"),
+            "liar": lambda _: self._disturb("liar"),
             "cpu_stolen": lambda _: self._disturb("busy", os.cpu_count() or 1),
             "restart_stage": lambda _: self._restart("stage", soak.start_stage),
             "restart_router": lambda _: self._restart("router", lambda: soak.rig.start_router(wait=False)),

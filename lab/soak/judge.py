@@ -30,7 +30,7 @@ from dehyst.lab.soak.observed import (
     between,
     told_by,
 )
-from dehyst.service.answers.which_model import SAMPLES_POISONED, SENSOR_FROZEN
+from dehyst.service.answers.which_model import SAMPLES_POISONED, SENSOR_FROZEN, VOLTAGE_DIFFERS
 from dehyst.service.storage.recorder import ASIDE
 from dehyst.service.storage.segments import close_left_open, segments
 
@@ -74,7 +74,7 @@ NAMED_S: Final = 0.5
 SENSOR_PCT: Final = 1.0
 OF_FROZEN: Final = 1.5
 #: Troubles that name a sensor or its samples.
-_NAMES: Final = SENSOR_FAULTS | {SENSOR_FROZEN, SAMPLES_POISONED}
+_NAMES: Final = SENSOR_FAULTS | {SENSOR_FROZEN, SAMPLES_POISONED, VOLTAGE_DIFFERS}
 
 
 def assess(observed: Observations) -> None:

@@ -29,6 +29,7 @@ from dehyst.service.operating.remote import statuses
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import SURELY, open_client
+from dehyst.service.security.authenticator import own_authenticator
 from dehyst.service.stage_node.faults import sound_key
 from dehyst.service.stage_node.node import status_key
 
@@ -174,20 +175,20 @@ class SampleTracker:
             batch = batch.where(batch.seq <= self.newest + STRAY)
             if not len(batch):
                 return
-        seq, u_V = batch.seq, batch.u_V
+        seq = batch.seq
         second.seq = int(seq[-1])
-        second.held += int(np.count_nonzero(self._held(seq, u_V)))
-        self._check(second, u_V)
         if abs(int(seq[0]) - self.newest) >= RESTART_GAP or (seq > self.newest).all():
-            # Steps only between consecutive samples; those in between were not seen.
-            steps = np.abs(np.diff(u_V, prepend=self._applied_V))[np.diff(seq, prepend=self._applied_seq) == 1]
-            second.step_V = float(np.fmax(second.step_V, np.max(steps, initial=0.0)))
-            self._applied_V, self._applied_seq = float(u_V[-1]), int(seq[-1])
             self.newest = int(seq[-1])
 
     def take_sound(self, batch: wire.SampleBatch) -> None:
-        """Add samples as a sound sensor reads them: these show where the stage is, whatever the service gets."""
-        second, seq = self._second(), batch.seq
+        """Add samples as they are, with what was applied and where the stage is, whatever the service gets."""
+        second, seq, u_V = self._second(), batch.seq, batch.u_V
+        second.held += int(np.count_nonzero(self._held(seq, u_V)))
+        self._check(second, u_V)
+        # Steps only between consecutive samples; those in between were not seen.
+        steps = np.abs(np.diff(u_V, prepend=self._applied_V))[np.diff(seq, prepend=self._applied_seq) == 1]
+        second.step_V = float(np.fmax(second.step_V, np.max(steps, initial=0.0)))
+        self._applied_V, self._applied_seq = float(u_V[-1]), int(seq[-1])
         known = (self._wanted_seq[seq % _RING] == seq) & np.isfinite(batch.y_um)
         error = np.abs(self._wanted[seq % _RING] - batch.y_um)
         second.judged += int(np.count_nonzero(known))
@@ -310,7 +311,9 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     # A reading that stays at its limit looks like a stage at rest.
     "saturate": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.saturated", "learner.jumps",
                  "samples.gates.unexcited", "event"),
-    **dict.fromkeys(("stuck_noisy", "sensor_gain", "sign", "other_stage"), ("trouble",)),
+    **dict.fromkeys(
+        ("stuck_noisy", "sensor_gain", "sign", "other_stage", "units", "exchanged", "u_sign"), ("trouble",)
+    ),
     "seq_jump": ("samples.gates.ahead",),
     "losses": ("samples.lost",),
     "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
@@ -465,7 +468,9 @@ class Monitor:
         self.malformed = 0
         self._lock = threading.Lock()
         self.session = open_client(endpoint, 10.0)
-        keys = Keys(STAGE, AXIS)
+        keys, self._by = Keys(STAGE, AXIS), own_authenticator()
+        #: What a stranger may have said is not taken.
+        self._signed = {keys.sample, keys.command, keys.status}
         self._subscribers = [
             self.session.declare_subscriber(key, self._guarded(take))
             for key, take in (
@@ -502,6 +507,9 @@ class Monitor:
 
     def _guarded(self, take: Callable[[bytes], None]) -> Callable[[zenoh.Sample], None]:
         def callback(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            if key in self._signed and self._by.heard(sample, key) is None:
+                return
             try:
                 with self._lock:
                     take(sample.payload.to_bytes())

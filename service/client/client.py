@@ -275,9 +275,12 @@ class RetryingQueries:
             follower.limits = known.limits
         return known
 
-    def feedforward(self, payload: bytes, wait_s: float, n: int, u_before_V: float) -> Trajectory:
+    def feedforward(
+        self, payload: bytes, wait_s: float, n: int, u_before_V: float, commands: bool = False
+    ) -> Trajectory:
         """The answer to an encoded query for ``n`` points, which is repeated for ``retry_s`` while there is none.
 
+        ``commands`` : whether it tells what is under way, which is believed where it is signed.
         ``u_before_V`` : the voltage before the first point that the query names, V; NaN: none.
         ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
         BehindError after that.
@@ -296,7 +299,7 @@ class RetryingQueries:
             return answer
 
         def ask() -> Trajectory:
-            question = self._by.question(payload=payload)
+            question = self._by.question(payload=payload, key=self._keys.feedforward if commands else "")
             sent: dict[str, Any] = {"payload": payload, "attachment": question.attachment}
             if len(payload) <= _SHORT_BYTES:
                 return self._first(self._querier.get(**sent), question, read)
@@ -524,7 +527,7 @@ class Client:
         query = continued(memory, model, u_before_V, after, begin)
         one = number("y_um", y_um), number("v_um_per_s", v_um_per_s), number("a_um_per_s2", a_um_per_s2)
         asked = encode_query(*one, as_of=as_of, **query)
-        answer = self._queries.feedforward(asked, wait_s, 1, query["u_before_V"])
+        answer = self._queries.feedforward(asked, wait_s, 1, query["u_before_V"], query.get("pending") is not None)
         if begin is not None:
             answer = with_pending(answer, query["pending"], begin, np.array([y_um]))
         return Answer(answer.u_V.item(0), answer.std_V.item(0), answer.flags.item(0), *answer[3:])
@@ -565,7 +568,7 @@ class Client:
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
         asked = encode_query(y, v, a, as_of=as_of, **query)
-        answer = self._queries.feedforward(asked, wait_s, y.size, query["u_before_V"])
+        answer = self._queries.feedforward(asked, wait_s, y.size, query["u_before_V"], query.get("pending") is not None)
         return answer if begin is None else with_pending(answer, query["pending"], begin, y)
 
     def follow(

@@ -27,7 +27,7 @@ from dehyst.service.answers.correcting import Answer, Correcting, Motion
 from dehyst.service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from dehyst.service.answers.guard import Limits, check_domain, guard, limit_voltage
 from dehyst.service.answers.which_model import Answering, answering, seen_in, trust_by_age
-from dehyst.service.protocol.delta import checksum, decode_delta, moved
+from dehyst.service.protocol.delta import Delta, checksum, decode_delta, moved
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.model import ModelMessage, decode_model
 from dehyst.service.protocol.query import (
@@ -99,11 +99,16 @@ class Follower:
         self._heard = heard or Heard(NO_KEY, "")
         self._fetching: threading.Thread | None = None
         self._fetched_s = -math.inf
+        #: Whether the last message could not be used without another whole model.
+        self._missing = False
+        self._asking, self._closing = threading.Lock(), threading.Event()
         self.received = self.lost = 0
         self._refused = 0
         self.last_error = ""
         #: The last whole model, and its checksum.
         self._whole: tuple[ModelMessage, int] | None = None
+        #: The last change of a whole model that has not come yet: it may be the last one for long.
+        self._left: Delta | None = None
         self._taking = threading.Lock()
         self._moved = threading.Condition()
         self._subscriber: Any = None
@@ -399,8 +404,10 @@ class Follower:
         if self._subscriber is not None:
             self._subscriber.undeclare()
             self._subscriber = None
-        if self._fetching is not None and self._fetching is not threading.current_thread():
-            self._fetching.join(_CLOSE_S)
+        self._closing.set()
+        fetching = self._fetching
+        if fetching is not None and fetching is not threading.current_thread():
+            fetching.join(_CLOSE_S)
 
     def _on_model(self, sample: zenoh.Sample) -> None:
         payload, known = self._heard.take(sample), not self._heard.is_unknown
@@ -413,36 +420,49 @@ class Follower:
             except DehystError as error:
                 self._refused += 1
                 self.last_error = str(error)
-        fetches = self._fetching is not None and self._fetching.is_alive()
-        if not known and not fetches and time.monotonic() - self._fetched_s >= _FETCH_S:
-            self._fetched_s = time.monotonic()
-            self._fetching = threading.Thread(target=self._fetch_whole, name="follower-fetches", daemon=True)
-            self._fetching.start()
+        with self._asking:
+            self._missing = not known
+            if self._missing and self._fetching is None:
+                self._fetching = threading.Thread(target=self._fetch_whole, name="follower-fetches", daemon=True)
+                self._fetching.start()
 
     def _fetch_whole(self) -> None:
-        """A whole model was lost, or somebody else publishes, by the same key: ask who serves now."""
-        try:
-            before = self.received
-            self._take_whole(self._fetch(), before)
-        except DehystError as error:
-            self.last_error = str(error)
+        """A whole model was lost, or somebody else publishes, by the same key: ask who serves now.
+
+        Once a second at most, and until the last message is known: another one may not come for long.
+        """
+        while True:
+            self._closing.wait(max(0.0, self._fetched_s + _FETCH_S - time.monotonic()))
+            with self._asking:
+                if not self._missing or self._closing.is_set():
+                    self._fetching = None
+                    return
+                self._missing = False
+            self._fetched_s = time.monotonic()
+            try:
+                before = self.received
+                self._take_whole(self._fetch(), before)
+            except DehystError as error:
+                self.last_error = str(error)
 
     def _take_whole(self, payload: bytes, before: int | None = None) -> None:
         """Take a whole model, unless others have come since there were ``before``: the newest counts."""
-        message = decode_model(payload)
+        message, base = decode_model(payload), checksum(payload)
         with self._taking:
             if before in (None, self.received):
-                self._take(message)
-                self._whole = message, checksum(payload)
+                left, self._left = self._left, None
+                self._take(moved(message, left) if left is not None and left.base == base else message)
+                self._whole = message, base
 
     def _take_change(self, payload: bytes) -> bool:
         """Take a change of the last whole model; one of another is left out, and False returned."""
         change = decode_delta(payload)
         with self._taking:
             if self._whole is None:
+                self._left = change
                 return True  # the first one is being fetched
             if change.base != self._whole[1]:
-                self.lost += 1
+                self._left, self.lost = change, self.lost + 1
                 return False
             self._take(moved(self._whole[0], change))
         return True

@@ -109,7 +109,7 @@ class Keys:
 
     @property
     def switch(self) -> str:
-        """Query of the instance that serves, which its standbys answer: the newest freeze or thaw, JSON."""
+        """Query of the instance that serves after an operator's verb: a standby answers once it holds the new state."""
         return f"{self.base}/switch"
 
     def tokens(self, kind: str) -> str:

@@ -47,13 +47,32 @@ ROLES: Final = {
     ROUTER: "passes on everything",
 }
 
-_ALL: Final = f"{ROOT}/**"
-_QUERIES: Final = ("feedforward", "model", "status")
-_OF_STAGE: Final = ("sample", "stage_status")
-_OF_CONTROLLER: Final = ("command", "reference")
-_OPERATE: Final = "operate"
+_SAMPLES: Final = ("*/*/sample", "*/*/stage_status")
+_VOLTAGES: Final = ("*/*/command", "*/*/reference")
 _LISTEN: Final = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 _SERVE: Final = ("reply", "declare_queryable", "liveliness_token")
+#: Rule -> messages, keys below the root, direction, and permission. Rules that deny override those that allow.
+_RULES: Final[dict[str, tuple[tuple[str, ...], tuple[str, ...], str, str]]] = {
+    "out": (("put", "declare_subscriber", *_SERVE), ("**",), "egress", "allow"),
+    "ask": (("query", *_LISTEN), ("**",), "egress", "allow"),
+    "listen": (_LISTEN, ("**",), "ingress", "allow"),
+    "query": (("query",), ("*/*/feedforward", "*/*/model", "*/*/status"), "ingress", "allow"),
+    "voltages": (("put",), _VOLTAGES, "ingress", "allow"),
+    "own": (("liveliness_token",), ("*/*/owner/**",), "ingress", "allow"),
+    "samples": (("put",), _SAMPLES, "ingress", "allow"),
+    "operate": (("query",), ("*/*/operate",), "ingress", "allow"),
+    "all": (("put", "query", *_SERVE), ("**",), "ingress", "allow"),
+    "no_input": (("put",), (*_SAMPLES, *_VOLTAGES), "ingress", "deny"),
+    "no_command": (("query",), ("*/*/operate",), "ingress", "deny"),
+}
+_ALLOWED: Final = {
+    CLIENT: ("out", "listen", "query"),
+    CONTROLLER: ("out", "listen", "query", "voltages", "own"),
+    STAGE: ("out", "listen", "query", "samples"),
+    OPERATOR: ("out", "listen", "query", "operate"),
+    SERVICE: ("out", "ask", "listen", "all", "no_input", "no_command"),
+    ROUTER: ("out", "ask", "listen", "all"),
+}
 
 
 def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -64,59 +83,23 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
     users : name -> role. The name is the common name of the certificate.
     stages : name of a user with the role ``stage`` -> the one stage on the wire it may publish for; "*" or none: any.
     """
-    stages = stages or {}
-    rules: list[dict[str, Any]] = [
-        _rule("out", ("put", "reply", "declare_subscriber", "declare_queryable", "liveliness_token"), [_ALL], "egress"),
-        _rule("listen", _LISTEN, [_ALL]),
-        _rule("query", ("query",), _keys(_QUERIES)),
-        _rule("voltages", ("put",), _keys(_OF_CONTROLLER)),
-        _rule("own", ("liveliness_token",), [f"{ROOT}/*/*/owner/**"]),
-        _rule("operate", ("query",), _keys((_OPERATE,))),
-        _rule("serve", (*_SERVE, "query", "put"), [_ALL]),
-        _rule("ask", ("query", *_LISTEN), [_ALL], "egress"),
-        # Deny rules override allow rules.
-        _rule("not_of_service", ("put",), _keys((*_OF_STAGE, *_OF_CONTROLLER)), permission="deny"),
-        _rule("not_commanding", ("query",), _keys((_OPERATE,)), permission="deny"),
-        _rule("pass_on", ("put", "query", *_SERVE), [_ALL]),
-    ]
-    allowed: dict[str, tuple[str, ...]] = {
-        CLIENT: ("out", "listen", "query"),
-        CONTROLLER: ("out", "listen", "query", "voltages", "own"),
-        OPERATOR: ("out", "listen", "query", "operate"),
-        SERVICE: ("out", "ask", "listen", "serve", "not_of_service", "not_commanding"),
-        ROUTER: ("out", "ask", "listen", "pass_on"),
-    }
-    policies = []
+    rules, policies = dict[str, dict[str, Any]](), []
     for name, role in users.items():
-        ids = allowed.get(role)
-        if ids is None:  # a stage: its keys are its own
-            rule = f"samples_{name}"
-            rules.append(_rule(rule, ("put",), _keys(_OF_STAGE, stages.get(name, "*"))))
-            ids = ("out", "listen", "query", rule)
-        policies.append({"id": name, "rules": list(ids), "subjects": [name]})
-    used = {rule for policy in policies for rule in policy["rules"]}
+        of = (stages or {}).get(name, "*")
+        ids = [f"{rule}_{name}" if rule == "samples" else rule for rule in _ALLOWED[role]]
+        policies.append({"id": name, "rules": ids, "subjects": [name]})
+        for id_, rule in zip(ids, _ALLOWED[role], strict=True):
+            messages, keys, flow, permission = _RULES[rule]
+            # The keys of a stage are its own.
+            at = [f"{ROOT}/{key.replace('*', of, 1) if rule == 'samples' else key}" for key in keys]
+            about = {"messages": list(messages), "flows": [flow], "permission": permission, "key_exprs": at}
+            rules[id_] = {"id": id_, **about}
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": [rule for rule in rules if rule["id"] in used],
+        "rules": list(rules.values()),
         "subjects": [{"id": name, "cert_common_names": [name]} for name in users],
         "policies": policies,
-    }
-
-
-def _keys(names: Sequence[str], stage: str = "*") -> list[str]:
-    return [f"{ROOT}/{stage}/*/{name}" for name in names]
-
-
-def _rule(
-    name: str, messages: Sequence[str], keys: Sequence[str], flow: str = "ingress", permission: str = "allow"
-) -> dict[str, Any]:
-    return {
-        "id": name,
-        "messages": list(dict.fromkeys(messages)),
-        "flows": [flow],
-        "permission": permission,
-        "key_exprs": list(keys),
     }
 
 
@@ -329,18 +312,12 @@ def check_reach(
     for kind, endpoints in (("listen", listen), ("connect", connect)):
         beyond = [endpoint for endpoint in endpoints if not insecure and not is_loopback(endpoint)]
         missing = missing_protection(zenoh_config, kind == "listen") if beyond else []
-        missing += [
-            f"{endpoint} is not one of {', '.join(_SECURE_PROTOCOLS)}"
-            for endpoint in beyond
-            if endpoint.split("/", 1)[0] not in _SECURE_PROTOCOLS
-        ]
+        plain = (endpoint for endpoint in beyond if endpoint.split("/", 1)[0] not in _SECURE_PROTOCOLS)
+        missing += [f"{endpoint} is not one of {', '.join(_SECURE_PROTOCOLS)}" for endpoint in plain]
         if missing:
-            raise FieldError(
-                f"{where}: {kind}",
-                f"{', '.join(beyond)} with {'; '.join(missing)}",
-                "an endpoint of this machine, or zenoh's configuration with TLS and access control",
-                ADVICE,
-            )
+            got = f"{', '.join(beyond)} with {'; '.join(missing)}"
+            expected = "an endpoint of this machine, or zenoh's configuration with TLS and access control"
+            raise FieldError(f"{where}: {kind}", got, expected, ADVICE)
 
 
 def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
@@ -349,19 +326,14 @@ def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
         return ["no zenoh_config"]
     config = read_zenoh_config(zenoh_config)
     tls, protocols = _section(config, "transport/link/tls"), _section(config, "transport/link/protocols")
-    return [
-        what
-        for what, is_missing in (
-            (
-                "transport/link/protocols not limited to tls or quic",
-                not protocols or not set(protocols) <= {*_SECURE_PROTOCOLS},
-            ),
-            ("verify_name_on_connect off", not listens and tls.get("verify_name_on_connect") is False),
-            ("no certificates of both ends (enable_mtls)", not tls.get("enable_mtls")),
-            ("no access control that denies by default", listens and not has_access_control(zenoh_config)),
-        )
-        if is_missing
-    ]
+    plain = not protocols or not set(protocols) <= {*_SECURE_PROTOCOLS}
+    lacks = {
+        "transport/link/protocols not limited to tls or quic": plain,
+        "verify_name_on_connect off": not listens and tls.get("verify_name_on_connect") is False,
+        "no certificates of both ends (enable_mtls)": not tls.get("enable_mtls"),
+        "no access control that denies by default": listens and not has_access_control(zenoh_config),
+    }
+    return [what for what, is_missing in lacks.items() if is_missing]
 
 
 def has_access_control(zenoh_config: Path | None) -> bool:

@@ -20,7 +20,7 @@ import secrets
 import struct
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -38,9 +38,8 @@ _LEAST, _MOST = 16, 64
 #: Bytes of a stamp, of the sender in it, and of a tag.
 STAMP, SENDER, TAG = 16, 8, 16
 _LENGTH: Final = struct.Struct("<Q").pack
-#: Stamps of queries, and senders of samples, that are remembered.
+#: Stamps of the queries on a key, and senders of publications, that are remembered.
 _REMEMBERED: Final = 65_536
-_SENDERS: Final = 16
 #: Pause between two looks for a reply, s.
 _POLL_S: Final = 0.001
 #: Options of `zenoh.Session.get`: the caller gets the replies of all instances, not the first one alone.
@@ -68,7 +67,8 @@ class Authenticator:
         self.sender = secrets.token_bytes(SENDER)
         self._number = 0
         self._lock = threading.Lock()
-        self._asked: OrderedDict[bytes, None] = OrderedDict()
+        #: By key: many queries of one must not make those of another forgotten.
+        self._asked: defaultdict[str, OrderedDict[bytes, None]] = defaultdict(OrderedDict)
 
     def __bool__(self) -> bool:
         return self._keyed is not None
@@ -126,11 +126,12 @@ class Authenticator:
         if not self.proves(attached[STAMP:], "query", key, stamp, str(query.parameters), payload_of(query.payload)):
             return False
         with self._lock:
-            if stamp in self._asked:
+            asked = self._asked[key]
+            if stamp in asked:
                 return False
-            self._asked[stamp] = None
-            if len(self._asked) > _REMEMBERED:
-                self._asked.popitem(last=False)
+            asked[stamp] = None
+            if len(asked) > _REMEMBERED:
+                asked.popitem(last=False)
         return True
 
     # ---- who asks and hears
@@ -205,7 +206,7 @@ class Question:
 
 
 class Rising:
-    """The highest number of each of the last senders: each of their messages counts once, in order."""
+    """The highest number of each sender: each of their messages counts once, in order."""
 
     def __init__(self) -> None:
         self._last: OrderedDict[bytes, int] = OrderedDict()
@@ -220,7 +221,7 @@ class Rising:
             return False
         self._last[sender] = number
         self._last.move_to_end(sender)
-        if len(self._last) > _SENDERS:
+        if len(self._last) > _REMEMBERED:
             self._last.popitem(last=False)
         return True
 
@@ -230,12 +231,12 @@ class Heard:
 
     Attributes
     ----------
-    refused : number of messages without a right tag. old : number of repeated ones. is_unknown : whether the last
-    message was left out because its sender is not that of the last reply; then query, and `meet` who replies.
+    refused : number of messages without a right tag. is_unknown : whether the last message was left out because its
+    sender is not that of the last reply; then query, and `meet` who replies.
     """
 
     def __init__(self, authenticator: Authenticator, key: str) -> None:
-        self.refused = self.old = 0
+        self.refused = 0
         self.is_unknown = False
         self._by, self._key = authenticator, key
         self._sender, self._rising = b"", Rising()
@@ -255,8 +256,6 @@ class Heard:
             self.refused += 1
         elif not self._by or (not self.is_unknown and self._rising.take(signed.stamp)):
             return signed.payload
-        elif not self.is_unknown:
-            self.old += 1
         return None
 
 

@@ -347,10 +347,11 @@ class Axis:
         """The time, s, since the newest sample that was handled came; None before any. For the publishing thread."""
         self._age_s = age_s
 
-    def answer(self, query: FeedforwardQuery, pace: Pace | None = None) -> Trajectory:
+    def answer(self, query: FeedforwardQuery, pace: Pace | None = None, commands: bool = True) -> Trajectory:
         """Voltages for a query, safe to apply. Raises InputError on a query that cannot be answered.
 
         ``pace`` : evaluate in slices, all from one snapshot, with this between them (`service.answers.slices`).
+        ``commands`` : whether what is under way is believed: it is compared with the samples, and corrected.
         """
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
         ring = self._snapshots
@@ -358,7 +359,7 @@ class Axis:
         def ask(asked: FeedforwardQuery) -> Trajectory:
             return answer(asked, ring, handled, self.config, self.limits, self._age_s, pace)
 
-        if query.pending is None:
+        if query.pending is None or not commands:
             return ask(query)
         got = ask(query) if self.correction is None else self.correction.answer(query, ask, ring, handled)
         self.witness.note(query.pending, query.y_um, got.u_V)

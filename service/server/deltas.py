@@ -20,7 +20,7 @@ from dehyst.service.server.moves import Move, same_choice
 
 #: Interval of the check for followers, s.
 _LOOK_S: Final = 0.05
-#: Pause between two whole models where nothing moves between them, s.
+#: Pause between two whole models where nothing moves between them, and before the last message is sent again, s.
 _PAUSE_S: Final = 0.1
 
 
@@ -36,6 +36,13 @@ class _Stream:
     payload: bytes = b""
     moved: bool = False
     sent_at_s: float = -math.inf
+    #: The last message, until it was sent twice: zenoh may drop it, and another may not come for long.
+    last: bytes = b""
+
+    def send(self, payload: bytes, now_s: float) -> None:
+        """Publish a message."""
+        self.last, self.sent_at_s = payload, now_s
+        self.put(payload)
 
 
 class DeltaStreams:
@@ -81,6 +88,9 @@ class DeltaStreams:
                     self._send_whole(stream, base, now_s)
             elif stream.moved or now_s - stream.sent_at_s >= _PAUSE_S or not same_choice(newest, stream.base):
                 self._send_whole(stream, newest, now_s)
+            if stream.last and now_s - stream.sent_at_s >= _PAUSE_S:
+                stream.put(stream.last)
+                stream.last = b""
 
     def _look(self, now_s: float) -> None:
         """Begin the streams that have followers now, and end those that have none."""
@@ -89,7 +99,7 @@ class DeltaStreams:
             if followed and stream.base is None:
                 self._send_whole(stream, self._axis.moves.base or self._axis.newest, now_s)
             elif not followed:
-                stream.base, stream.payload = None, b""
+                stream.base, stream.payload, stream.last = None, b"", b""
         self._axis.moves.want(any(stream.base is not None for stream in self._streams.values()))
 
     def _send_whole(self, stream: _Stream, served: Served, now_s: float) -> None:
@@ -98,8 +108,8 @@ class DeltaStreams:
         model, seq, memory = self._axis.model(stream.name, served)
         payload = encode_model(stream.name, model, seq, memory, self._axis.safety(stream.name, served))
         # First the state: a follower that gets a change may ask at once for the model that it is of.
-        stream.base, stream.payload, stream.moved, stream.sent_at_s = served, payload, False, now_s
-        stream.put(payload)
+        stream.base, stream.payload, stream.moved = served, payload, False
+        stream.send(payload, now_s)
 
     def _moves(self, stream: _Stream, base: Served) -> bool:
         """Whether what moves is in this model: not in a champion that is another one than learns."""
@@ -113,4 +123,4 @@ class DeltaStreams:
             # The other contestants' memories stay those of the whole model: to track them costs as much as learning.
             memory = model.with_memory(move.base.memories[stream.name], self._axis.config.learn, memory)
         stream.moved = True
-        stream.put(encode_delta(move.seq, checksum(stream.payload), move.part, memory))
+        stream.send(encode_delta(move.seq, checksum(stream.payload), move.part, memory), now_s)

@@ -18,7 +18,7 @@ from dehyst.service.protocol.container import JSON, to_json
 from dehyst.service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.model import encode_model
-from dehyst.service.protocol.query import decode_query, encode_reply, points_of
+from dehyst.service.protocol.query import Trajectory, decode_query, encode_reply, points_of
 from dehyst.service.protocol.samples import MAX_COUNT
 from dehyst.service.security.authenticator import NO_KEY, Authenticator
 from dehyst.service.server.axis import Axis
@@ -148,7 +148,7 @@ class QueryAnswers:
                 self._hand_on(query, data, points)
                 return
             assert data is not None
-            reply = encode_reply(self._axis.answer(decode_query(data)))
+            reply = encode_reply(self._answer(query, data))
             # Leaving the context finishes the query; otherwise the caller waits until its time is over.
             key = self._keys.feedforward
             with query:
@@ -162,6 +162,12 @@ class QueryAnswers:
             self._refuse(query, error)
         finally:
             self._long.short_ends()
+
+    def _answer(self, query: zenoh.Query, data: bytes, pace: Pace | None = None) -> Trajectory:
+        asked = decode_query(data)
+        # Anybody may ask; who says what was commanded has to show the key.
+        commands = asked.pending is not None and self._by.is_asked_by_ours(query, self._keys.feedforward)
+        return self._axis.answer(asked, pace, commands)
 
     def _hand_on(self, query: zenoh.Query, data: bytes | None, points: int) -> None:
         """Answer in another thread. Raises BusyError if others ask for too much."""
@@ -183,8 +189,8 @@ class QueryAnswers:
             try:
                 payload = query.payload
                 assert payload is not None
-                asked = decode_query(payload.to_bytes() if data is None else data)
-                return partial(send, encode_reply(self._axis.answer(asked, pace)))
+                asked = payload.to_bytes() if data is None else data
+                return partial(send, encode_reply(self._answer(query, asked, pace)))
             except Exception as error:
                 return partial(refuse, error)
 

@@ -42,6 +42,15 @@ DELIVERY: Final = {
     "clock": "s added to the time of every sample",
     "seq_jump": "added to the number of one sample",
     "losses": "share of the samples that are not sent, 0 to 1",
+    "units": "not used: voltages come in mV and readings in nm",
+    "exchanged": "not used: voltages and readings come in each other's place",
+    "u_sign": "not used: voltages have the other sign",
+}
+#: Faults of what a message says, from voltages and readings to those that are sent.
+_SAYS: Final[dict[str, Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]]] = {
+    "units": lambda u_V, y_um: (1e3 * u_V, 1e3 * y_um),
+    "exchanged": lambda u_V, y_um: (y_um, u_V),
+    "u_sign": lambda u_V, y_um: (-u_V, y_um),
 }
 CHANGE: Final = "change"
 #: Faults in which the sensor goes on from its last reading.
@@ -218,6 +227,8 @@ class Injector:
                 sent = [*sent, *sent]
             elif kind == "clock":
                 sent = [(r[0], r[1] + active.fault.value * hit, r[2], r[3]) for r in sent]
+            elif kind in _SAYS:
+                sent = [(*r[:2], *np.where(hit, _SAYS[kind](r[2], r[3]), r[2:])) for r in sent]
             elif kind == "losses":
                 kept = ~hit | (self._loss_rng.uniform(size=hit.size) >= active.fault.value)
                 self.counts[kind] -= int(np.count_nonzero(kept & hit))

@@ -76,6 +76,7 @@ def test_an_answer_at_rest_stays_while_a_smooth_motion_teaches() -> None:
     assert said_V[-1] == pytest.approx(39.0 / 10.45, rel=1e-3)
 
 
+@pytest.mark.timeout(900)  # half a minute of computing, with many processes beside
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -135,6 +136,7 @@ def late(t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> Columns:
     return t_s, u_V, np.concatenate([np.full(5, y_um[0]), y_um[:-5]])
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("bad", "seed"),
     [(in_mV_and_nm, 0), (clock_in_ms, 0), (late, 0), (exchanged, 300_000_000), (of_another_stage, 300_000_000)],

@@ -404,7 +404,8 @@ def delta_steps() -> list[Step]:
         left("older", change(base, linear), "lost", kernel, kernel),
         taken("after-kernel", after_kernel, kernel),
         left("gap", change(missed, after_missed), "lost", after_kernel, kernel),
-        taken("repaired", missed, missed, "fetched"),
+        # The change that was left out is of it.
+        taken("repaired", after_missed, missed)._replace(message="fetched", payload=missed.payload()),
         taken("last", last, missed),
         *(left(name, change(missed, last, **fields), "refused", last, missed) for name, fields in wrong.items()),
         taken("whole", frozen, frozen),

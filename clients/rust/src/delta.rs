@@ -40,11 +40,13 @@ fn crc32(bytes: &[u8]) -> u32 {
 pub struct Changes {
     whole: Snapshot,
     base: u32,
+    /// The last change of a whole model that has not come yet: it may be the last one for long.
+    left: Option<Delta>,
 }
 
 impl Changes {
     pub fn new(payload: &[u8]) -> Result<Changes> {
-        Ok(Changes { whole: Snapshot::decode(payload)?, base: crc32(payload) })
+        Ok(Changes { whole: Snapshot::decode(payload)?, base: crc32(payload), left: None })
     }
 
     /// Checksum of the whole model.
@@ -55,11 +57,16 @@ impl Changes {
     /// A payload of kind 6, or of kind 7. With `Taken` the snapshot to use.
     pub fn take(&mut self, payload: &[u8]) -> Result<(Update, Option<Snapshot>)> {
         if payload.get(1) != Some(&DELTA) {
-            *self = Changes::new(payload)?;
-            return Ok((Update::Taken, Some(self.whole.clone())));
+            if crc32(payload) == self.base {
+                return Ok((Update::Taken, None)); // fetched late: the changes since are not undone
+            }
+            let left = std::mem::replace(self, Changes::new(payload)?).left.filter(|left| left.base == self.base);
+            let newest = left.map_or_else(|| Ok(self.whole.clone()), |left| self.whole.moved(&left))?;
+            return Ok((Update::Taken, Some(newest)));
         }
         let delta = Delta::decode(payload)?;
         if delta.base != self.base {
+            self.left = Some(delta);
             return Ok((Update::Lost, None));
         }
         Ok((Update::Taken, Some(self.whole.moved(&delta)?)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import socket
 import struct
 import subprocess
 import time
@@ -20,10 +21,13 @@ import zenoh
 
 import tests.conftest  # noqa: F401  the key that service and clients share
 from dehyst.service.client.client import Client
+from dehyst.service.protocol.errors import CommandHeldError
 from dehyst.service.protocol.model import encode_model
 from dehyst.service.protocol.query import Answer as Reply
 from dehyst.service.protocol.query import decode_reply, encode_query, encode_reply
+from dehyst.service.protocol.samples import encode_command
 from tests.service.conftest import ServeProcess, make_models, unused_port, write_config
+from tests.service.living import eventually
 
 LIBRARY = os.environ.get("DEHYST_ZENOH_LIBRARY", "")
 pytestmark = pytest.mark.skipif(not LIBRARY, reason="DEHYST_ZENOH_LIBRARY names no library: build clients/rust/zenoh")
@@ -48,9 +52,15 @@ def native() -> ctypes.CDLL:
     library.dehyst_error.restype = ctypes.c_char_p
     library.dehyst_open.argtypes = [ctypes.c_char_p] * 4 + [ctypes.c_double, ctypes.POINTER(ctypes.c_void_p)]
     library.dehyst_point.argtypes = [ctypes.c_void_p] + [ctypes.c_double] * 3 + [ctypes.POINTER(Answer)]
+    library.dehyst_warm.argtypes = [ctypes.c_void_p] + [ctypes.c_double] * 3
     library.dehyst_report.argtypes = [ctypes.c_void_p, ctypes.POINTER(Report)]
     library.dehyst_close.argtypes = [ctypes.c_void_p]
     library.dehyst_close.restype = None
+    library.dehyst_link_open.argtypes = [*[ctypes.c_char_p] * 4, ctypes.c_double, ctypes.POINTER(ctypes.c_void_p)]
+    library.dehyst_link_send.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_size_t]
+    library.dehyst_take_command.argtypes = [ctypes.c_void_p, ctypes.c_int]
+    library.dehyst_link_close.argtypes = [ctypes.c_void_p]
+    library.dehyst_link_close.restype = None
     return library
 
 
@@ -82,10 +92,14 @@ def test_the_native_follower_is_the_python_follower(native: ctypes.CDLL, endpoin
             payload = stage_samples(k, 50, 1.0 if k % 4000 < 2000 else 0.94)
             session.put(f"{client.keys.base}/sample", payload, congestion_control=zenoh.CongestionControl.BLOCK)
             time.sleep(0.01)
-        until = time.monotonic() + 20.0
-        while client.status()["seq"] < begin + 3999 and time.monotonic() < until:
-            time.sleep(0.05)
-        time.sleep(0.3)  # the last model comes
+        assert mine.wait(begin + 3999, 60.0)
+
+        def has_newest() -> bool:  # `dehyst_warm` takes the newest model and leaves the memory
+            assert native.dehyst_warm(handle, 40.0, 0.0, 0.0) == 0, native.dehyst_error()
+            assert native.dehyst_report(handle, ctypes.byref(report)) == 0
+            return bool(report.snapshot_seq == begin + 3999)
+
+        eventually(has_newest, 60.0)
         # Whatever came meanwhile, both go along the same motion from their memories of the start.
         for i in range(40):
             y, v = 40.0 + 10.0 * np.sin(0.1 * i), 1000.0 * np.cos(0.1 * i)
@@ -104,9 +118,6 @@ def test_the_native_follower_is_the_python_follower(native: ctypes.CDLL, endpoin
 
 def test_a_liar_beside_the_service_is_not_believed(native: ctypes.CDLL, endpoint: str) -> None:
     handle, link, answer, size = ctypes.c_void_p(), ctypes.c_void_p(), Answer(), ctypes.c_size_t()
-    native.dehyst_link_open.argtypes = [
-        *[ctypes.c_char_p] * 4, ctypes.c_double, ctypes.POINTER(ctypes.c_void_p),
-    ]  # fmt: skip
     native.dehyst_link_ask.argtypes = [
         ctypes.c_void_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t,
         ctypes.POINTER(ctypes.c_size_t),
@@ -154,11 +165,7 @@ def test_a_liar_beside_the_service_is_not_believed(native: ctypes.CDLL, endpoint
 def test_what_c_sends_is_learnt_and_signed(native: ctypes.CDLL, endpoint: str) -> None:
     """A batch by one call: the service takes each sample, believes the sender's signature, and learns a new gain."""
     link = ctypes.c_void_p()
-    native.dehyst_link_open.argtypes = [
-        *[ctypes.c_char_p] * 4, ctypes.c_double, ctypes.POINTER(ctypes.c_void_p),
-    ]  # fmt: skip
     native.dehyst_samples.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_void_p] * 4]
-    native.dehyst_link_close.argtypes = [ctypes.c_void_p]
     assert native.dehyst_link_open(endpoint.encode(), b"demo", b"y", None, 5.0, ctypes.byref(link)) == 0
     with Client.connect(endpoint, axis="y") as client:
         before = client.point(40.0, model="lssvm_adaptive").u_V
@@ -168,9 +175,7 @@ def test_what_c_sends_is_learnt_and_signed(native: ctypes.CDLL, endpoint: str) -
             columns = [k[at : at + 50], k[at : at + 50] * 1e-3, u[at : at + 50], 0.94 * (11.0 * u[at : at + 50] + 1.0)]
             assert native.dehyst_samples(link, 50, *(c.ctypes.data for c in columns)) == 0, native.dehyst_error()
             time.sleep(0.01)
-        until = time.monotonic() + 20.0
-        while client.status()["seq"] < 3999 and time.monotonic() < until:
-            time.sleep(0.05)
+        client.wait_learnt(3999, 60.0)
         status = client.status()
         assert (status["seq"], status["samples"]["received"]) == (3999, 4000)
         assert client.point(40.0, model="lssvm_adaptive").u_V > before + 0.1
@@ -185,6 +190,39 @@ def test_what_c_sends_is_learnt_and_signed(native: ctypes.CDLL, endpoint: str) -
     assert native.dehyst_samples(link, 1, None, *[u.ctypes.data] * 3) == -1
     assert b"seq: got a null pointer" in native.dehyst_error()
     native.dehyst_link_close(link)
+
+
+def test_one_controller_at_a_time_commands_from_c_too(native: ctypes.CDLL, endpoint: str) -> None:
+    first, second = ctypes.c_void_p(), ctypes.c_void_p()
+    for link in (first, second):
+        assert native.dehyst_link_open(endpoint.encode(), b"demo", b"x", None, 5.0, ctypes.byref(link)) == 0
+    voltages = encode_command(0, np.full(20, 4.0))
+
+    def sends(link: ctypes.c_void_p) -> bool:
+        return bool(native.dehyst_link_send(link, b"command", voltages, len(voltages)) == 0)
+
+    me = f"process {os.getpid()} on ".encode()
+    with Client.connect(endpoint) as client:
+        assert sends(first)
+        owner = eventually(lambda: client.status()["command"]["owner"], 20.0)
+        assert (owner["process"], owner["host"]) == (os.getpid(), socket.gethostname())
+        assert not sends(second)
+        assert b"command: got a second controller, expected one: " + me in native.dehyst_error()
+        with pytest.raises(CommandHeldError, match=rf"process {os.getpid()} on "):
+            client.command(0, np.full(20, 4.0))
+        assert sends(first)
+        assert native.dehyst_take_command(second, 1) == 0
+        assert sends(second)
+        eventually(lambda: not sends(first), 20.0)  # it is told
+        assert me in native.dehyst_error()
+        native.dehyst_link_close(second)
+        eventually(lambda: sends(first), 20.0)
+        client.take_command(force=True)
+        eventually(lambda: not sends(first), 20.0)
+        client.command(0, np.full(20, 4.0))
+        assert client.status()["command"]["refused"] == 0
+    eventually(lambda: sends(first), 20.0)
+    native.dehyst_link_close(first)
 
 
 def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
@@ -218,10 +256,7 @@ def test_a_stage_and_a_controller_that_asks_ahead_in_rust_and_in_c(endpoint: str
             assert stage.returncode == 0, errors
         assert out.startswith("2000 samples")
         assert out.endswith("0 commands refused\n")
-        until = time.monotonic() + 20.0
-        while client.status()["samples"]["received"] < received + 2000 and time.monotonic() < until:
-            time.sleep(0.05)
-        assert client.status()["samples"]["received"] == received + 2000
+        eventually(lambda: client.status()["samples"]["received"] == received + 2000, 60.0)
 
 
 @pytest.mark.parametrize("threads", [[], ["--receivers"], ["--core", "--warm"]])

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from dehyst.service.stage_node.faults import Fault, Injector
 
 Y_UM = 40.0 + 10.0 * np.sin(0.05 * np.arange(400))
+
+
+@pytest.mark.parametrize(
+    ("kind", "shown"),
+    [
+        ("units", lambda u, y: (1e3 * u, 1e3 * y)),
+        ("exchanged", lambda u, y: (y, u)),
+        ("u_sign", lambda u, y: (-u, y)),
+    ],
+)
+def test_a_message_that_says_something_else_does_so_for_the_fault_alone(kind: str, shown: Any) -> None:
+    injector = Injector(1e-3, lambda _: None)
+    injector.add(Fault(kind, 0.2))
+    injector.reading(100, 0.0)
+    seq = np.arange(90, 310)
+    u_V, y_um = 0.1 * seq, Y_UM[seq]
+    ((_, _, sent_V, sent_um),) = injector.deliver((seq, 1e-3 * seq, u_V, y_um))
+    hit = (seq >= 100) & (seq < 300)
+    for sent, sound, wrong in zip((sent_V, sent_um), (u_V, y_um), shown(u_V, y_um), strict=True):
+        np.testing.assert_array_equal(sent, np.where(hit, wrong, sound))
+    assert injector.counts[kind] == 200
 
 
 def read(kind: str, value: float = 0.0) -> np.ndarray:

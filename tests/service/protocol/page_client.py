@@ -172,15 +172,19 @@ class Changes:
         self.base = 0
         self._whole: dict[str, Any] = {}
         self._change: tuple[int, list[float], list[float]] | None = None
+        self._left = bytes(24)
 
     def take(self, data: bytes) -> str:
         """A payload of kind 6 or 7."""
         if data[1] == 6:
             self._whole, self.base, self._change = decode_model(data), zlib.crc32(data), None
+            if struct.unpack_from("<I", self._left, 16)[0] == self.base:
+                self.take(self._left)
             return "taken"
         version, kind, options, p, seq, base, m = struct.unpack_from("<BBHIqII", data)
         assert (version, kind, options, len(data)) == (1, 7, 0, 24 + 8 * (9 + p + m))
         if base != self.base:
+            self._left = data
             return "lost"
         values = list(struct.unpack_from(f"<{9 + p + m}d", data, 24))
         moving, memory = values[: 9 + p], values[9 + p :]

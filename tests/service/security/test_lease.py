@@ -284,7 +284,7 @@ def test_what_an_owner_said_before_it_lost_the_lease_is_not_repeated(free_port: 
 
 
 def test_without_an_owner_commands_are_applied_as_they_come(stage: tuple[Stage, str]) -> None:
-    """Clients in other languages hold no token; a controller that holds one has precedence from then on."""
+    """Who publishes by zenoh alone holds no token; a controller that holds one has precedence from then on."""
     found, endpoint = stage
     with open_client(endpoint, 5.0) as plain, Client.connect(endpoint, timeout_s=5.0) as client:
         plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(1000, 2.0)), congestion_control=SURELY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -20,7 +21,7 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.service.client.client import Client
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import NoReplyError
-from dehyst.service.protocol.query import encode_query
+from dehyst.service.protocol.query import Pending, encode_query
 from dehyst.service.runtime.session import open_client
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import write_config
@@ -248,6 +249,31 @@ def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: 
         ):
             assert lost() == name
             eventually(lambda: client.status()["trouble"] == "", 5.0)
+
+
+def test_a_stranger_cannot_say_what_was_commanded(serve: Callable[..., Any]) -> None:
+    """A controller has asked, and goes on by itself; somebody without the key asks on with voltages under way."""
+    process, n = serve(), 20
+    with Client.connect(process.endpoint, timeout_s=5.0) as client, open_client(process.endpoint) as stranger:
+        put = stranger.declare_publisher(client.keys.sample, congestion_control=zenoh.CongestionControl.BLOCK)
+        answer = None
+        for begin in range(0, 3000, n):
+            k = np.arange(begin, begin + n)
+            wave = 2.0 * np.pi * 2.0 * k * DT_S
+            u_V = 4.0 + 2.5 * np.sin(wave)
+            if begin < 2000:
+                y_um = 45.0 + 30.0 * np.sin(wave)
+                answer = client.trajectory(y_um, 377.0 * np.cos(wave), after=answer, begin=begin)
+                u_V = answer.u_V
+            else:
+                lie = Pending(begin, np.full(n, 90.0), np.full(n, 9.0))
+                payload, attached = encode_query(90.0, 0.0, pending=lie), os.urandom(32)
+                replies = list(stranger.get(client.keys.feedforward, payload=payload, attachment=attached))
+                assert [reply.ok is not None for reply in replies] == [True]  # anybody may ask
+            put.put(wire.encode_samples(k, k * DT_S, u_V, 1.0 + 10.45 * u_V))
+        status = eventually(lambda: (found := client.status())["seq"] == 2999 and found)
+        assert status["trouble"] == ""
+        assert status["samples"]["gates"].get("not_commanded", 0) == 0
 
 
 def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) -> None:

@@ -84,7 +84,7 @@ int main(int argc, char **argv) {
             schedule(SCHED_IDLE, 0);
         if (core)
             keep_to(0);
-        if (dehyst_open(argv[3], argv[4], argv[5], argv[6], 5.0, &stage)) {
+        if (dehyst_open(argv[3], argv[4], argv[5], argv[6], 20.0, &stage)) {
             fprintf(stderr, "%s\n", dehyst_error());
             return 1;
         }

@@ -30,8 +30,12 @@ int dehyst_link_open(const char *endpoint, const char *stage, const char *axis, 
 int dehyst_samples(const dehyst_link *link, size_t n, const int64_t *seq, const double *t_s, const double *u_V,
                    const double *y_um);
 
-/* Publish a payload. Waits while the wire is full, so that nothing is dropped. */
+/* Publish a payload. Waits while the wire is full, so that nothing is dropped. The first one on "command" makes this link
+ * the owner of the axis' voltages until it is closed; while another controller owns them, it is an error that names it. */
 int dehyst_link_send(const dehyst_link *link, const char *key, const uint8_t *payload, size_t bytes);
+
+/* Own the voltages from now on. force: not 0, although another controller does, whose commands are then left out. */
+int dehyst_take_command(const dehyst_link *link, int force);
 
 /* The next payload that came; *bytes is 0 where none came within wait_s. One thread at a time. */
 int dehyst_link_receive(const dehyst_link *link, double wait_s, uint8_t *payload, size_t room, size_t *bytes);

@@ -107,6 +107,13 @@ pub unsafe extern "C" fn dehyst_link_send(
 }
 
 /// # Safety
+/// `to` comes from `dehyst_link_open`.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_take_command(to: *const Link, force: c_int) -> c_int {
+    guarded(|| link(to)?.take_command(force != 0))
+}
+
+/// # Safety
 /// `to` comes from `dehyst_link_open`; the columns have `n` values each.
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_samples(

@@ -10,11 +10,13 @@
 
 pub mod authenticator;
 pub mod ffi;
+pub mod key;
+mod lease;
 mod link;
 
 pub use link::Link;
 
-use authenticator::{Authenticator, Heard, Sender, STAMP};
+use authenticator::{Authenticator, Sender, STAMP};
 use dehyst::json::{self, Value};
 use dehyst::{Error, Follower, Limits, Publisher, Result, Update};
 use std::hash::{BuildHasher, RandomState};
@@ -93,7 +95,7 @@ pub fn open(options: &Options) -> Result<Live> {
     let session = zenoh::open(config(options)?)
         .wait()
         .map_err(|error| failed("endpoints", error, "the endpoint of a running service"))?;
-    let asker = Asker { session, by: Arc::new(Authenticator::find(options.key.as_deref())?) };
+    let asker = Asker { session, by: Arc::new(key::find(options.key.as_deref())?) };
     let mut feed = Feed { _subscriber: None, asker, base, timeout: options.timeout };
     let status = feed.status()?;
     let text = |name: &str| status.get(name).and_then(Value::text).unwrap_or("").to_string();
@@ -101,7 +103,7 @@ pub fn open(options: &Options) -> Result<Live> {
     let limits = limits_of(&status)?;
     // Subscribe before the fetch, so that no model is missed between the two; a follower is made by the fetch.
     let (early, waiting) = std::sync::mpsc::sync_channel::<(Vec<u8>, Vec<u8>)>(64);
-    let sender = Arc::new(Mutex::new(Sender::default()));
+    let sender = Arc::new(Mutex::new(Sender(0)));
     let publisher = Arc::new(OnceLock::<Publisher>::new());
     let key = match name.as_str() {
         "auto" => Some("champion"),
@@ -127,9 +129,8 @@ pub fn open(options: &Options) -> Result<Live> {
                 };
                 let known = match locked(&sender).hear(&by, &key, &attached, &payload) {
                     // What is refused is counted there.
-                    Heard::Taken => !matches!(publisher.update(&payload), Ok(Update::Lost)),
-                    Heard::Refused => true,
-                    Heard::Unknown => false, // another instance serves
+                    Some(true) => !matches!(publisher.update(&payload), Ok(Update::Lost)),
+                    refused => refused.is_some(), // else another instance serves
                 };
                 if !known {
                     let _ = fetch.try_send(()); // one that waits already is enough
@@ -145,7 +146,7 @@ pub fn open(options: &Options) -> Result<Live> {
     let own = follower.publisher();
     while let Ok((payload, attached)) = waiting.try_recv() {
         let key = key.as_deref().unwrap_or_default();
-        if locked(&sender).hear(&feed.asker.by, key, &attached, &payload) == Heard::Taken {
+        if locked(&sender).hear(&feed.asker.by, key, &attached, &payload) == Some(true) {
             let _ = own.update(&payload); // what is missing shows with the next change
         }
     }
@@ -225,8 +226,8 @@ impl Feed {
     }
 }
 
-fn locked(sender: &Mutex<Sender>) -> std::sync::MutexGuard<'_, Sender> {
-    sender.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+fn locked<T>(held: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    held.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 fn bytes_of(attached: Option<&ZBytes>) -> Vec<u8> {
@@ -257,10 +258,14 @@ impl Asker {
         loop {
             let left = until.saturating_duration_since(Instant::now());
             let stamp = random();
+            // What is under way is believed of who has the key; payloads are on `feedforward` alone.
+            let key = selector.split('?').next().unwrap_or_default();
+            let parts: [&[u8]; 5] = [b"query", key.as_bytes(), &stamp, parameters.as_bytes(), payload];
+            let tag = self.by.tag(&parts).filter(|_| !payload.is_empty());
+            let attached: Vec<u8> = stamp.into_iter().chain(tag.into_iter().flatten()).collect();
             let asked = self.session.get(selector).timeout(left.max(Duration::from_millis(100)));
             // Whoever answers first must not keep the others' replies from us.
-            let asked =
-                asked.target(QueryTarget::All).consolidation(ConsolidationMode::None).attachment(stamp.to_vec());
+            let asked = asked.target(QueryTarget::All).consolidation(ConsolidationMode::None).attachment(attached);
             let asked = if payload.is_empty() { asked } else { asked.payload(payload) };
             let replies = asked.wait().map_err(|error| failed("query", error, "an open session"))?;
             let (mut failure, mut unsigned) = (None, 0);

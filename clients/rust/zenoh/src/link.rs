@@ -1,18 +1,24 @@
 //! Bytes to and from the keys of an axis, without a model: what a stage, or a controller that asks ahead, needs.
 
-use crate::authenticator::Authenticator;
-use crate::{base_of, config, failed, random, Asker, Options};
+use crate::{base_of, config, failed, key, lease::Lease, locked, random, Asker, Options};
 use dehyst::{wire, Result};
 use std::sync::mpsc::{channel, Receiver};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use zenoh::{pubsub::Subscriber, qos::CongestionControl, Wait};
+
+/// Whose publications these are, how many there were, and the right to command.
+struct Sent {
+    sender: [u8; 8],
+    number: u64,
+    lease: Lease,
+}
 
 /// A connection. It ends when it is dropped.
 pub struct Link {
     asker: Asker,
-    /// Whose publications these are, and how many there were; held while one is sent, so that they arrive in order.
-    sent: Mutex<([u8; 8], u64)>,
+    /// Held while a message is sent, so that they arrive in order.
+    sent: Mutex<Sent>,
     base: String,
     timeout: Duration,
     /// Payloads of the key that is received, and what takes them from the wire.
@@ -38,20 +44,31 @@ impl Link {
                 Some((payloads, subscriber))
             }
         };
-        let asker = Asker { session, by: Arc::new(Authenticator::find(options.key.as_deref())?) };
+        let asker = Asker { session, by: Arc::new(key::find(options.key.as_deref())?) };
         let [a, b, c, d, e, f, g, h, ..] = random();
-        let sent = Mutex::new(([a, b, c, d, e, f, g, h], 0));
+        let sender = [a, b, c, d, e, f, g, h];
+        let lease = Lease::new(asker.session.clone(), asker.by.clone(), &base, &sender);
+        let sent = Mutex::new(Sent { sender, number: 0, lease });
         Ok(Link { asker, sent, base, timeout: options.timeout, received })
     }
 
-    /// Publish on a key; waits while the wire is full, so that nothing is dropped.
+    /// Publish on a key; waits while the wire is full, so that nothing is dropped. The first `command` makes this link
+    /// the owner of the axis' voltages. It is an error where another controller owns them.
     pub fn send(&self, key: &str, payload: Vec<u8>) -> Result<()> {
+        let mut sent = locked(&self.sent);
+        if key == "command" {
+            sent.lease.take(false)?;
+        }
         let key = format!("{}/{key}", self.base);
-        let mut sent = self.sent.lock().unwrap_or_else(PoisonError::into_inner);
-        sent.1 += 1;
-        let attached = self.asker.by.publication(&key, sent.0, sent.1, &payload);
+        sent.number += 1;
+        let attached = self.asker.by.publication(&key, sent.sender, sent.number, &payload);
         let put = self.asker.session.put(key, payload).congestion_control(CongestionControl::Block);
         put.attachment(attached).wait().map_err(|error| failed("send", error, "an open session"))
+    }
+
+    /// Command the axis from now on; `force`: although another controller does, whose commands are then left out.
+    pub fn take_command(&self, force: bool) -> Result<()> {
+        locked(&self.sent).lease.take(force)
     }
 
     /// Publish samples of the stage, which the service learns from; see [`dehyst::wire::samples`].
