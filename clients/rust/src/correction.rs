@@ -284,6 +284,7 @@ pub struct Correcting {
     most_v: f64,
     dt_s: f64,
     wanted_um: Vec<f64>,
+    flagged: Vec<bool>,
     numbers: Vec<i64>,
     readings: VecDeque<(i64, f64)>,
     read: i64,
@@ -319,6 +320,7 @@ impl Correcting {
             most_v: integral.map_or(0.0, |settings| settings.share * drive_v),
             dt_s,
             wanted_um: vec![f64::NAN; KEPT],
+            flagged: vec![false; KEPT],
             numbers: vec![-1; KEPT],
             readings: VecDeque::with_capacity(KEPT),
             read: -1,
@@ -364,7 +366,7 @@ impl Correcting {
         for (k, y) in y_um.iter().enumerate() {
             let number = self.number + k as i64;
             let at = number as usize % KEPT;
-            (self.numbers[at], self.wanted_um[at]) = (number, *y);
+            (self.numbers[at], self.wanted_um[at], self.flagged[at]) = (number, *y, false);
         }
         if troubled || !self.on {
             self.readings.clear();
@@ -421,11 +423,14 @@ impl Correcting {
             repetition.set(self.age, slope, lag_s);
         }
         while let Some((number, read_um)) = self.readings.pop_front() {
-            let (wanted_um, before_um) = (self.asked(number), self.asked(number - 1));
+            let (mut wanted_um, before_um) = (self.asked(number), self.asked(number - 1));
             let mut repeats = false;
             if let Some(repetition) = &mut self.repetition {
                 repetition.read(number, wanted_um - read_um);
                 repeats = repetition.active;
+            }
+            if self.flagged[number.rem_euclid(KEPT as i64) as usize] {
+                wanted_um = f64::NAN; // not what the model has answered
             }
             if let Some(integral) = self.integral.as_mut().filter(|_| !repeats) {
                 integral.take(wanted_um - read_um, (wanted_um - before_um) / self.dt_s);
@@ -433,14 +438,13 @@ impl Correcting {
         }
     }
 
-    /// Take what the points got in the end, V; readings of those with flags are no residual.
+    /// Take what the points got in the end, V. The readings of those with flags are left out of the integral; what
+    /// repeats is learnt from them too: from the voltage that they got, whatever it came of.
     pub(crate) fn answered(&mut self, u_v: &[f64], flags: &[u8]) {
         let integral_v = self.integral_v();
         for (k, (u_v, flags)) in u_v.iter().zip(flags).enumerate() {
             let number = self.number + k as i64;
-            if *flags != 0 {
-                self.wanted_um[number as usize % KEPT] = f64::NAN;
-            }
+            self.flagged[number as usize % KEPT] = *flags != 0;
             if let Some(repetition) = &mut self.repetition {
                 repetition.applied(number, u_v - integral_v);
             }
