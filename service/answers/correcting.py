@@ -121,12 +121,13 @@ class Correcting:
         self._wanted_um[numbers % _KEPT], self._flagged[numbers % _KEPT] = points[0][-_KEPT:], False
         point = points[0][:1], points[1][:1], points[2][:1]
         before, self._model = self._model, model
-        changed = before is not None and before is not model and before.memory_size == memory.size
-        if changed and self.correction is not None and self.correction.takes_over:
-            assert before is not None
-            changed_V = model.feedforward(*point, memory).u_V.item(0) - before.feedforward(*point, memory).u_V.item(0)
-            if math.isfinite(changed_V):
-                self.correction.hand_over(changed_V)
+        if self.correction is not None:
+            if before is not None and before is not model and before.memory_size == memory.size:
+                changed_V = (model.feedforward(*point, memory).u_V - before.feedforward(*point, memory).u_V).item(0)
+                if math.isfinite(changed_V):
+                    self.correction.hand_over(changed_V, point[1].item(0))
+            for _ in range(n):
+                self.correction.let_in()
         u_V, std_V = answer
         if self.trouble or not self.on:
             self._readings.clear()

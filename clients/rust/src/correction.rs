@@ -148,7 +148,6 @@ pub struct Integral {
     before_um: f64,
     readings: f64,
     speed: f64,
-    rests: bool,
     held_v: f64,
     watch: Oscillation,
     quiet_s: f64,
@@ -204,15 +203,12 @@ impl Integral {
         let alpha = dt_s / (dt_s + filter_s);
         self.filtered_um += alpha * (residual_um - self.filtered_um);
         let mut error_um = self.filtered_um;
-        self.rests = speed_um_per_s.abs() * (filter_s + self.designed.0 as f64 * dt_s) < self.noise_um;
-        if self.rests {
+        if self.at_rest(speed_um_per_s) {
             // At rest: what the noise explains would only make the stage jitter.
             let dead_um = DEAD_SIGMA * self.noise_um * (alpha / (2.0 - alpha)).sqrt();
             error_um -= error_um.max(-dead_um).min(dead_um);
         }
-        let given_v = alpha * self.held_v;
-        self.held_v -= given_v;
-        let u_v = self.added.u_v + self.added.factor * gain_per_s * dt_s * self.slope * error_um - given_v;
+        let u_v = self.added.u_v + self.added.factor * gain_per_s * dt_s * self.slope * error_um;
         // A bound that has come down takes the correction along as slowly as it is let go.
         let most_v = self.bound_v.max(self.added.u_v.abs() * (1.0 - dt_s / self.fade_s));
         self.added.u_v = u_v.max(-most_v).min(most_v);
@@ -224,19 +220,26 @@ impl Integral {
     }
 
     /// Give up what a new model has taken over: its voltage is by `taken_v` above that of the one before. At rest the
-    /// voltage stays, and the rest of the change comes with the low-pass: a model changes with noise.
-    fn hand_over(&mut self, taken_v: f64) {
+    /// voltage stays, and `let_in` the rest of the change: a model changes with noise.
+    fn hand_over(&mut self, taken_v: f64, speed_um_per_s: f64) {
         let left_v = self.added.u_v - taken_v;
-        let u_v = left_v.max(self.added.u_v.min(0.0)).min(self.added.u_v.max(0.0));
-        if self.rests {
-            self.held_v += left_v - u_v;
+        self.added.u_v = left_v.max(self.added.u_v.min(0.0)).min(self.added.u_v.max(0.0));
+        if self.at_rest(speed_um_per_s) {
+            self.held_v += left_v - self.added.u_v;
+            self.added.u_v = left_v;
         }
-        self.added.u_v = if self.rests { left_v } else { u_v };
     }
 
-    /// Whether `hand_over` has anything to do.
-    fn takes_over(&self) -> bool {
-        self.rests || self.added.u_v != 0.0
+    /// Once for each point: let in of a new model what is held back, as fast as the low-pass of the readings.
+    fn let_in(&mut self) {
+        let part_v = self.held_v * self.dt_s / (self.dt_s + self.loop_.1);
+        self.held_v -= part_v;
+        self.added.u_v -= part_v;
+    }
+
+    /// Whether the way within low-pass and age is less than the noise.
+    fn at_rest(&self, speed_um_per_s: f64) -> bool {
+        speed_um_per_s.abs() * (self.loop_.1 + self.designed.0 as f64 * self.dt_s) < self.noise_um
     }
 
     /// Keep the correction for one sample without a reading; after `fade_s` of them in a row let it go.
@@ -255,7 +258,7 @@ impl Integral {
         }
         self.added.u_v = (self.added.u_v.abs() - self.fade_v).max(0.0).copysign(self.added.u_v);
         (self.filtered_um, self.before_um) = (0.0, f64::NAN);
-        (self.rests, self.held_v) = (false, 0.0);
+        self.held_v = 0.0;
     }
 
     /// Halve the gain once an oscillation lasts that is as fast as the loop or faster.
@@ -410,6 +413,9 @@ impl Correcting {
             u_v.iter_mut().for_each(|u| *u += self.integral_v() + repeated_v);
             return;
         }
+        if let Some(integral) = &mut self.integral {
+            u_v.iter().for_each(|_| integral.let_in());
+        }
         if let Some((first, _)) = self.readings.front() {
             self.age_held += 1;
             let age = self.number + u_v.len() as i64 - 1 - first;
@@ -476,15 +482,10 @@ impl Correcting {
         }
     }
 
-    /// Whether the integral is to know of a new model.
-    pub(crate) fn takes_over(&self) -> bool {
-        self.integral.as_ref().is_some_and(Integral::takes_over)
-    }
-
     /// A new model gives a voltage that is by `changed_v` above that of the one before.
-    pub(crate) fn hand_over(&mut self, changed_v: f64) {
+    pub(crate) fn hand_over(&mut self, changed_v: f64, speed_um_per_s: f64) {
         if let Some(integral) = self.integral.as_mut().filter(|_| changed_v.is_finite()) {
-            integral.hand_over(changed_v);
+            integral.hand_over(changed_v, speed_um_per_s);
         }
     }
 
