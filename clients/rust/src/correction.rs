@@ -406,15 +406,15 @@ impl Correcting {
     /// Add the corrections to the model's voltages `u_v`, V, for the next points; `std_v`: deviation that it states for
     /// the first one, V. `troubled`: as for `ask`.
     pub(crate) fn correct(&mut self, y_um: &[f64], u_v: &mut [f64], std_v: f64, troubled: bool) {
+        if let Some(integral) = &mut self.integral {
+            u_v.iter().for_each(|_| integral.let_in());
+        }
         if troubled || !self.on {
             self.integral.iter_mut().for_each(Integral::release);
             self.repetition.iter_mut().for_each(Repetition::release);
             let repeated_v = self.repetition.as_ref().map_or(0.0, |repetition| repetition.added.u_v);
             u_v.iter_mut().for_each(|u| *u += self.integral_v() + repeated_v);
             return;
-        }
-        if let Some(integral) = &mut self.integral {
-            u_v.iter().for_each(|_| integral.let_in());
         }
         if let Some((first, _)) = self.readings.front() {
             self.age_held += 1;

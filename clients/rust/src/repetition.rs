@@ -99,7 +99,7 @@ impl Kernel {
             for k in 2..=passes as usize {
                 sum += (1.0 - known(back - period)) * weight(back - k as f64 * period + lead, cutoff, half);
             }
-            if passes > 1.0 { sum * known(back) } else { sum }
+            sum * if passes > 1.0 { known(back) } else { 1.0 }
         }));
         let sum: f64 = self.weights.iter().sum();
         self.weights.iter_mut().for_each(|weight| *weight /= sum);
