@@ -56,30 +56,16 @@ class Design(NamedTuple):
 _NONE: Final = Design(0.0, 0, math.inf)
 
 
-def low_pass(x: FloatArray, cutoff: float, half: int) -> FloatArray:
-    """(n,) weights, not normalised, of a low-pass without phase, (n,) ``x`` samples from its middle, whole or not."""
-    shape = np.i0(_KAISER * np.sqrt(np.maximum(0.0, 1.0 - (x / (half + 0.5)) ** 2)))
-    return np.where(np.abs(x) <= half + 0.5, np.sinc(2.0 * cutoff * x) * shape, 0.0)
+def kernel(delay: float, cutoff: float, half: int) -> tuple[int, FloatArray]:
+    """(delay of the first weight in samples, (2 half + 1,) weights) of a low-pass without phase about ``delay``.
 
-
-def kernel(period: float, lead: float, newest: int, cutoff: float, half: int) -> FloatArray:
-    """(n,) weights, which sum to 1, of the `low_pass` about the pass before, ``period - lead`` samples back.
-
-    The last weight is that of the sample ``newest`` back. Later samples are not known yet; in their place are those of
-    one or more passes before, which the motion repeats. The change from one to the other is gradual, so that a period
-    may have a part of a sample.
+    ``delay`` : samples, whole or not. The weights sum to 1.
     """
-    ramp = half // 4 + 1
-    passes = max(math.ceil((half + newest + lead + ramp) / period), 1)
-    oldest = math.ceil(max(period - lead + half, min(newest + ramp + period, passes * period - lead + half)))
-    back = np.arange(oldest, newest - 1, -1, dtype=np.float64)
-    weights = low_pass(back - period + lead, cutoff, half)
-    for k in range(2, passes + 1):
-        unknown = 1.0 - np.clip((back - period - newest) / ramp, 0.0, 1.0)
-        weights += unknown * low_pass(back - k * period + lead, cutoff, half)
-    if passes > 1:
-        weights *= np.clip((back - newest) / ramp, 0.0, 1.0)
-    return weights / weights.sum()
+    first = round(delay) - half
+    x = np.arange(first, first + 2 * half + 1) - delay
+    shape = np.i0(_KAISER * np.sqrt(np.maximum(0.0, 1.0 - (x / (half + 0.5)) ** 2)))
+    weights = np.sinc(2.0 * cutoff * x) * shape
+    return first, weights / weights.sum()
 
 
 def most_lag_s(cutoff: float, half: int, mode_Hz: float, dt_s: float) -> float:
@@ -95,12 +81,11 @@ def most_lag_s(cutoff: float, half: int, mode_Hz: float, dt_s: float) -> float:
     # The sum of w[k] cos(2 pi f k) by rows of n weights: k = n i + j.
     n = math.isqrt(half) + 1
     rows = np.zeros((n, n))
-    rows.flat[: half + 1] = low_pass(np.arange(half + 1.0), cutoff, half)
+    rows.flat[: half + 1] = kernel(0.0, cutoff, half)[1][half:]
     rows.flat[1 : half + 1] *= 2.0
-    rows /= rows.sum()
     turn = np.exp(2j * np.pi * np.outer(f, np.arange(n)))
-    response = ((turn @ rows.T) * np.exp(2j * np.pi * n * np.outer(f, np.arange(n)))).sum(axis=1).real
-    allowed = GROWTH / np.abs(response)
+    low_pass = ((turn @ rows.T) * np.exp(2j * np.pi * n * np.outer(f, np.arange(n)))).sum(axis=1).real
+    allowed = GROWTH / np.abs(low_pass)
     share, peak = f / (mode_Hz * dt_s), 0.5 / LEAST_DAMPING
     below, most = share < 1.0, GAIN * (1.0 + SLOPE_ERROR)
     lift = np.minimum(1.0 / np.maximum(1.0 - share[below] ** 2, 1.0 / peak), peak)
@@ -284,15 +269,19 @@ class Repetition:
             self._plan()
 
     def _plan(self) -> None:
-        """Kernels of voltage and residual for the period."""
-        self._reach = KEPT
+        """Kernels of voltage and residual for the period: of as many passes back as their last readings need."""
+        self._passes = 0
         cutoff, half, _ = self.design
         if self.period is None or not cutoff or self._age < 0:
             return
         lead = self._lag_s / self._dt_s
-        self._of_w = kernel(self.period, 0.0, 1, cutoff, half)
-        self._of_r = kernel(self.period, lead, self._age, cutoff, half)
-        self._reach = max(self._of_w.size, self._of_r.size + self._age - 1)
+        self._passes = math.ceil((half + 1.0 + lead + self._age) / self.period)
+        self._delay = self._passes * self.period
+        self._at_w, of_w = kernel(self._delay, cutoff, half)
+        self._at_r, of_r = kernel(self._delay - lead, cutoff, half)
+        self._of_w, self._of_r = of_w[::-1].copy(), of_r[::-1].copy()
+        if self._at_w + 2 * half + 1 > KEPT:
+            self._passes = 0
 
     def read(self, number: int, residual_um: float) -> None:
         """Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
@@ -349,17 +338,18 @@ class Repetition:
         if not self.active:
             self.release()
             return self.u_V
-        assert self.period is not None
-        voltage = self._of_w @ self._w[i - self._of_w.size : i]
-        end = i - self._age + 1
-        low = float(self._of_r @ self._r[end - self._of_r.size : end])
+        half = self.design.half
+        begin = i - self._at_w - 2 * half
+        voltage = self._of_w @ self._w[begin : begin + 2 * half + 1]
+        begin = i - self._at_r - 2 * half
+        low = float(self._of_r @ self._r[begin : begin + 2 * half + 1])
         low = low if low == low else 0.0
         self._low[i] = low
-        before = self._low.item(max(i - round(self.period), 0))
+        before = self._low.item(max(i - round(self._delay), 0))
         if before == before:
             # Only what both passes have repeats.
             low = math.copysign(min(abs(low), abs(before)), low) if low * before > 0.0 else 0.0
-        self._weight = min(self._weight + 1.0 / self.design.half, 1.0)
+        self._weight = min(self._weight + 1.0 / half, 1.0)
         u_V = float(voltage + GAIN * self.factor * low - answer_V)
         self.u_V = self._weight * min(max(u_V, -self._bound_V), self._bound_V)
         return self.u_V
@@ -400,7 +390,8 @@ class Repetition:
             self._forget()
             return
         # The first pass is left out: hysteresis and creep of a motion that has begun are not yet those of the next.
-        if number - self._reach <= self._same_since + self.period or self._reach >= KEPT:
+        back = self._at_w + 2 * self.design.half if self._passes else KEPT
+        if number - back <= self._same_since + self.period:
             self.release()  # older readings or another lag may need more than there is
         elif not self.active:
             self.active, self._span = True, span

@@ -64,50 +64,34 @@ fn bessel_i0(x: f64) -> f64 {
 
 /// Weight, not normalised, `x` samples from the middle of a low-pass.
 fn weight(x: f64, cutoff: f64, half: usize) -> f64 {
-    let share = x / (half as f64 + 0.5);
-    if share.abs() > 1.0 {
-        return 0.0;
-    }
     let z = 2.0 * cutoff * x * PI;
     let sinc = if z == 0.0 { 1.0 } else { z.sin() / z };
+    let share = x / (half as f64 + 0.5);
     sinc * bessel_i0(KAISER * (1.0 - share * share).max(0.0).sqrt())
 }
 
-/// A low-pass without phase about the pass before.
+/// A low-pass without phase about a delay of samples, whole or not.
 #[derive(Default)]
 struct Kernel {
     /// Delay of the last weight, samples.
-    newest: usize,
+    first: usize,
     /// Oldest sample first; they sum to 1.
     weights: Vec<f64>,
 }
 
 impl Kernel {
-    /// About `period - lead` samples back. Samples less than `newest` back are not known yet; in their place are those
-    /// of one or more passes before, which the motion repeats, with a gradual change from one to the other.
-    fn set(&mut self, period: f64, lead: f64, newest: usize, cutoff: f64, half: usize) {
-        let (ramp, reach) = ((half / 4 + 1) as f64, half as f64);
-        let new = newest as f64;
-        let passes = ((reach + new + lead + ramp) / period).ceil().max(1.0);
-        let reach = (period - lead + reach).max((new + ramp + period).min(passes * period - lead + reach)).ceil();
-        let known = |back: f64| ((back - new) / ramp).clamp(0.0, 1.0);
-        self.newest = newest;
+    fn set(&mut self, delay: f64, cutoff: f64, half: usize) {
+        self.first = delay.round_ties_even() as usize - half;
+        let oldest = self.first + 2 * half;
         self.weights.clear();
-        self.weights.extend((newest..=reach as usize).rev().map(|back| {
-            let back = back as f64;
-            let mut sum = weight(back - period + lead, cutoff, half);
-            for k in 2..=passes as usize {
-                sum += (1.0 - known(back - period)) * weight(back - k as f64 * period + lead, cutoff, half);
-            }
-            sum * if passes > 1.0 { known(back) } else { 1.0 }
-        }));
+        self.weights.extend((0..=2 * half).map(|j| weight((oldest - j) as f64 - delay, cutoff, half)));
         let sum: f64 = self.weights.iter().sum();
         self.weights.iter_mut().for_each(|weight| *weight /= sum);
     }
 
     /// Samples back to the oldest one.
     fn reach(&self) -> usize {
-        self.newest + self.weights.len() - 1
+        self.first + self.weights.len() - 1
     }
 
     /// Its output at sample `at` of `values`.
@@ -325,8 +309,9 @@ pub struct Repetition {
     square: Vec<f64>,
     base: i64,
     next: i64,
-    /// Samples back to the oldest one that the kernels use; `KEPT`: there are none.
-    reach: usize,
+    /// Whether the kernels are those of the period, and its passes back as whole samples.
+    planned: bool,
+    back: usize,
     of_w: Kernel,
     of_r: Kernel,
     since: i64,
@@ -345,7 +330,7 @@ impl Repetition {
     /// `mode_hz`: lowest frequency at which the stage rings. `fade_s`: time without good readings after which the
     /// correction is let go. `bound_v`: largest correction, and largest residual that is no doubt.
     pub(crate) fn new(dt_s: f64, mode_hz: f64, fade_s: f64, bound_v: f64) -> Repetition {
-        let kernel = || Kernel { newest: 0, weights: Vec::with_capacity(2 * KEPT) };
+        let kernel = || Kernel { first: 0, weights: Vec::with_capacity(KEPT) };
         let column = || vec![0.0; 2 * KEPT];
         Repetition {
             added: Added::WHOLE,
@@ -408,14 +393,18 @@ impl Repetition {
         }
     }
 
-    /// Kernels of voltage and residual for the period.
+    /// Kernels of voltage and residual for the period: of as many passes back as their last readings need.
     fn plan(&mut self) {
-        self.reach = KEPT;
+        self.planned = false;
         let (Some(period), Some(Design { cutoff, half, .. })) = (self.period, self.design) else { return };
         let lead = self.lag_s / self.dt_s;
-        self.of_w.set(period, 0.0, 1, cutoff, half);
-        self.of_r.set(period, lead, self.age as usize, cutoff, half);
-        self.reach = self.of_w.reach().max(self.of_r.reach());
+        let delay = ((half as f64 + 1.0 + lead + self.age as f64) / period).ceil() * period;
+        if delay.round_ties_even() + half as f64 + 1.0 > KEPT as f64 {
+            return;
+        }
+        self.of_w.set(delay, cutoff, half);
+        self.of_r.set(delay - lead, cutoff, half);
+        (self.planned, self.back) = (true, delay.round_ties_even() as usize);
     }
 
     /// Take the residual, wanted less read, µm, of a sample; one not finite, or beyond the bound, is doubted.
@@ -494,8 +483,7 @@ impl Repetition {
             low = 0.0;
         }
         self.low_v[i] = low;
-        let pass = self.period.unwrap_or_default().round_ties_even() as usize;
-        let before = self.low_v[i.saturating_sub(pass)];
+        let before = self.low_v[i.saturating_sub(self.back)];
         if !before.is_nan() {
             // Only what both passes have repeats.
             low = if low * before > 0.0 { low.abs().min(before.abs()).copysign(low) } else { 0.0 };
@@ -554,7 +542,8 @@ impl Repetition {
             return;
         }
         // The first pass is left out: hysteresis and creep of a motion that has begun are not yet those of the next.
-        if self.reach >= KEPT || (number - self.reach as i64) as f64 <= self.same_since as f64 + period {
+        let reach = if self.planned { self.of_w.reach() } else { KEPT };
+        if (number - reach as i64) as f64 <= self.same_since as f64 + period {
             self.release(); // older readings or another lag may need more than there is
         } else if !self.active {
             (self.active, self.span_um) = (true, span_um);
