@@ -623,7 +623,7 @@ class Corrected:
 
 
 def corrected_by_integral() -> Corrected:
-    """A slow way up, and rest: readings that are late, doubted, missing, or oscillate; new models on the way and at rest; a trouble."""
+    """A slow way up, and rest: readings that are late, doubted, missing, or oscillate; new models; a trouble."""
     k = np.arange(1200)
     y = np.where(k < 700, 40.0 + 0.01 * k, 47.0)
     noise_um = 0.003 * (k * 7919 % 13 - 6) / 6.0
