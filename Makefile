@@ -89,8 +89,9 @@ docs: .setup-test ## the site of the documentation, offline, into out/site; a wa
 bench: setup-test ## the solver beside its yardsticks
 	$(BIN)/dehyst bench
 
-foreign: setup ## 500 random stages and events in lockstep, with the table of goals (half an hour; SEED=0)
+foreign: setup ## 500 random stages and events in lockstep, with the table of goals, and controllers (40 minutes; SEED=0)
 	$(BIN)/python -m benchmarks.foreign --runs 500 --first-seed $(SEED) --jobs 2 --json out/foreign.jsonl
+	$(BIN)/python -m benchmarks.foreign --controllers 1 5 20 --runs 10 --first-seed $(SEED) --jobs 2 --json out/controllers.jsonl
 
 fuzz: setup-test ## a million malformed payloads, by coverage, and a live service under fire (minutes)
 	$(BIN)/python -m benchmarks.fuzz --out out/fuzz

@@ -33,7 +33,7 @@ from dehyst.lab.rehearsal.disturbance import Event
 from dehyst.lab.rehearsal.reference import Motion
 from dehyst.service.reports.tables import markdown
 from tests.foreign.motions import motion
-from tests.foreign.plants import random_plant
+from tests.foreign.plants import Traits, random_plant
 
 #: Controllers, see `lab.rehearsal.controllers`.
 WAYS: Final = ("alone", "corrected", "frozen+I", "frozen", "I")
@@ -99,8 +99,12 @@ def course_of(seed: int) -> ForeignCourse:
     traits = factory.traits
     low_V, high_V = traits.excite_V
     known = identify(factory, RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, compete=()))
-    mode_Hz = OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
-    return ForeignCourse.of(factory, known, low_V, mode_Hz, seed, name=traits.hysteresis)
+    return ForeignCourse.of(factory, known, low_V, mode_of(traits), seed, name=traits.hysteresis)
+
+
+def mode_of(traits: Traits) -> float:
+    """The frequency that is stated of a stage as the lowest at which it rings, Hz."""
+    return OF_MODE * traits.modes[0][0] if traits.modes else NO_MODE_HZ
 
 
 def follow(course: ForeignCourse, way: str, age: int, case: str) -> Record:

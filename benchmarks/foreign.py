@@ -10,7 +10,7 @@ file gets a line for each run as it ends; a further call goes on where it ends, 
 the file holds that many hours of simulated time, and prints each trouble that was reported.
 
 ``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
-on stages on which nothing happens.
+on stages on which nothing happens; with ``--repetition`` also by followers with and without ``[axis.repetition]``.
 
 ``--controllers 1 5 20 --runs 10`` runs the corrections beside other controllers, with readings so many samples old
 (``lab.rehearsal.controllers``), and prints medians and worst ones. A stage takes a minute or two.
@@ -137,7 +137,9 @@ def motion_runs(given: argparse.Namespace) -> list[Run]:
     recording = foreign_motions.RECORDINGS[given.poor]
     return [
         (
-            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after, given.true_length),
+            functools.partial(
+                foreign_motions.run_motion, name, seed, recording, given.after, given.true_length, given.repetition
+            ),
             {"seed": seed, "recording": recording, "motion": name},
         )
         for name, seed in foreign_motions.planned(given.motions, given.first_seed, given.runs)
@@ -489,6 +491,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--poor", action="store_true", help="--motions: identify from 2 s of half the stroke")
     parser.add_argument(
         "--true-length", action="store_true", help="--motions: hold for an hour, stand for a night; takes hours"
+    )
+    parser.add_argument(
+        "--repetition", action="store_true", help="--motions: also followed with and without [axis.repetition]"
     )
     parser.add_argument(
         "--block", type=int, default=5, metavar="N",

@@ -2,6 +2,9 @@
 
 ``python -m benchmarks.foreign --motions raster:10,tone:50 --runs 40`` runs them. Errors are mean absolute errors in
 percent of the commanded range, from ``FROM_S`` after the begin of the motion on.
+
+With ``--repetition`` a follower with ``[axis.correction]`` and ``[axis.repetition]`` follows each motion too, beside
+the same follower without them, with readings ``AGE`` samples old; a second table compares them.
 """
 
 from __future__ import annotations
@@ -15,9 +18,13 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.correction import mode_of
 from benchmarks.records import Record, recorded
-from dehyst.lab.rehearsal import Event, RehearsalConfig, identify, run_event
+from dehyst.lab.rehearsal import Event, Motion, RehearsalConfig, identify, run_event
+from dehyst.lab.rehearsal.controllers import Course
 from dehyst.lab.rehearsal.outcome import moving_mean
+from dehyst.lab.rehearsal.reference import ReferenceRequest
+from dehyst.lab.rehearsal.runs import times
 from dehyst.service.protocol.query import BLENDED, OUTSIDE_DOMAIN, STAND_IN
 from dehyst.service.reports.tables import json_form, markdown
 from tests.foreign.motions import MOTIONS, motion
@@ -41,6 +48,10 @@ FAST_HZ, FAST_RATE_HZ = 20.0, 1000.0
 FAST_TONE_HZ, FAST_TONE_MODE_HZ = 50.0, 300.0
 #: Learning is compared with not learning over every window of this length, s; with errors of at least this, percent.
 WINDOW_S, FLOOR_PCT = 2.0, 0.02
+#: Readings of the followers, samples old.
+AGE: Final = 5
+#: Controllers that follow, see `lab.rehearsal.controllers`, and what their errors are called.
+FOLLOWED: Final = {"alone": "followed_pct", "repetition": "repeated_pct"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +97,13 @@ def _fitting(name: str, first_seed: int) -> Iterator[int]:
 
 
 def run_motion(
-    name: str, seed: int, recording: str = "full", after_s: float = AFTER_S, true_length: bool = False
-) -> Record:
-    """One motion on one stage, learning and frozen, as JSON values. If it raises, the record holds the traceback."""
+    name: str, seed: int, recording: str = "full", after_s: float = AFTER_S, true_length: bool = False,
+    repetition: bool = False,
+) -> Record:  # fmt: skip
+    """One motion on one stage, learning and frozen, as JSON values. If it raises, the record holds the traceback.
+
+    repetition : also followed, with and without the repetition.
+    """
     record: Record = {"seed": seed, "recording": recording, "motion": name}
     with recorded(record):
         factory = random_plant(seed)
@@ -145,10 +160,23 @@ def run_motion(
                 "ends_at_rail": run.outcome.adaptive.ends_at_rail,
             }
         )
+        if repetition:
+            span, n = known.high_um - known.low_um, one.size
+            wish = ReferenceRequest(
+                known.rest_um, known.low_um + BAND[0] * span, known.low_um + BAND[1] * span, n * dt_s, seed
+            )
+            wanted = maker(wish)(times(n, dt_s))
+            clipped = np.clip(wanted.y_um, known.low_um, known.high_um)
+            course = Course(
+                seed, factory, low_V, mode_of(traits), known, Motion(clipped, *wanted[1:]), run.range_um
+            )  # fmt: skip
+            for way, key in FOLLOWED.items():
+                got = course.follow(way, AGE, Event("none", "none", from_s))[0]
+                record[key] = float(100.0 / run.range_um * np.abs(clipped - got.true_um)[part].mean())
     return record
 
 
-# ---- the table
+# ---- the tables
 
 
 HEAD = (
@@ -198,6 +226,23 @@ def row(name: str, records: Sequence[Record]) -> tuple[str, ...]:
     )
 
 
+def repetition_table(records: Sequence[Record]) -> str:
+    """Markdown: motions followed with and without the repetition."""
+    rows = []
+    for name in dict.fromkeys(record["motion"] for record in records):
+        done = [record for record in records if record["motion"] == name and "repeated_pct" in record]
+        if done:
+            frozen, alone, repeated = (_values(done, key) for key in ("frozen_pct", *FOLLOWED.values()))
+            rows.append(
+                (name, str(len(done)), *(f"{np.median(v):.3f} / {v.max():.3f}" for v in (frozen, alone, repeated)),
+                 f"{np.median(repeated / alone):.2f} / {(repeated / alone).max():.2f}",
+                 f"{(repeated / frozen).max():.2f}", str(GOALS.get(name, Goal())))
+            )  # fmt: skip
+    head = ("motion", "runs", "frozen, median / worst", "learning, followed", "with repetition",
+            "repetition over that", "worst repetition over frozen", "goal")  # fmt: skip
+    return f"followed, readings {AGE} samples old\n\n{markdown(head, rows)}" if rows else ""
+
+
 def table(records: Sequence[Record]) -> str:
     """Markdown: one row for each motion and kind of recording, in the order of `MOTIONS`."""
     kinds = list(MOTIONS)
@@ -213,6 +258,7 @@ def table(records: Sequence[Record]) -> str:
         rows = [row(name, [record for record in of_it if record["motion"] == name]) for name in names]
         if rows:
             parts.append(f"identified from a {recording} recording\n\n{markdown(HEAD, rows)}")
+            parts += filter(None, [repetition_table(sorted(of_it, key=lambda record: place(record["motion"])))])
     return "\n\n".join(parts)
 
 

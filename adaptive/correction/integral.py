@@ -166,7 +166,7 @@ class Correction:
         self._slope, self._bound_V, self._most_V = 0.0, 0.0, 0.0
         self._filtered_um, self._before_um = 0.0, math.nan
         self.noise_um, self._readings = 0.0, 0
-        self._speed = 0.0
+        self._speed, self._held_V = 0.0, 0.0
         self._watch, self._quiet_s = _Oscillation(), 0.0
         self._waited_s, self._fade_V = 0.0, 0.0
 
@@ -212,7 +212,7 @@ class Correction:
         alpha = dt_s / (dt_s + filter_s)
         self._filtered_um += alpha * (residual_um - self._filtered_um)
         error_um = self._filtered_um
-        if abs(speed_um_per_s) * (filter_s + self._designed[0] * dt_s) < self.noise_um:
+        if self._at_rest(speed_um_per_s):
             # At rest: what the noise explains would only make the stage jitter.
             dead_um = _DEAD_SIGMA * self.noise_um * math.sqrt(alpha / (2.0 - alpha))
             error_um -= min(max(error_um, -dead_um), dead_um)
@@ -226,13 +226,27 @@ class Correction:
         """Begin with ``u_V``, V, as far as it is within ``bound_V``."""
         self.u_V = min(max(u_V, -bound_V), bound_V)
 
-    def hand_over(self, taken_V: float) -> None:
+    def hand_over(self, taken_V: float, speed_um_per_s: float) -> None:
         """Give up what a new model has taken over: its voltage is by ``taken_V`` above that of the one before.
 
-        Only what the correction carries: it does not resist the model, and comes no further from 0.
+        Only what the correction carries: it does not resist the model, and comes no further from 0. At rest the voltage
+        stays, and `let_in` the rest of the change: a model changes with the noise that it learns from.
         """
         left_V = self.u_V - taken_V
         self.u_V = min(max(left_V, min(self.u_V, 0.0)), max(self.u_V, 0.0))
+        if self._at_rest(speed_um_per_s):
+            self._held_V += left_V - self.u_V
+            self.u_V = left_V
+
+    def let_in(self) -> None:
+        """Once for each point: let in of a new model what is held back, as fast as the low-pass of the readings."""
+        part_V = self._held_V * self._dt_s / (self._dt_s + self.loop.filter_s)
+        self._held_V -= part_V
+        self.u_V -= part_V
+
+    def _at_rest(self, speed_um_per_s: float) -> bool:
+        """Whether the way within low-pass and age is less than the noise."""
+        return abs(speed_um_per_s) * (self.loop.filter_s + self._designed[0] * self._dt_s) < self.noise_um
 
     def wait(self) -> None:
         """Keep the correction for one sample without a reading; after ``fade_s`` of them in a row let it go."""
@@ -246,6 +260,7 @@ class Correction:
         self._fade_V = self._fade_V or abs(self.u_V) * self._dt_s / self._fade_s
         self.u_V = math.copysign(max(abs(self.u_V) - self._fade_V, 0.0), self.u_V)
         self._filtered_um, self._before_um = 0.0, math.nan
+        self._held_V = 0.0
 
     def _look(self, residual_um: float, level_um: float, turned: bool) -> None:
         """Halve the gain once an oscillation lasts that is as fast as the loop or faster."""

@@ -74,6 +74,7 @@ class Correcting:
         self.age = 0
         self._dt_s, self._slope_every = dt_s, math.ceil(_SLOPE_S / dt_s)
         self._wanted_um = np.full(_KEPT, math.nan)
+        self._flagged = np.zeros(_KEPT, dtype=bool)
         self._numbers = np.full(_KEPT, -1, dtype=np.int64)
         self._readings: deque[tuple[int, float]] = deque(maxlen=_KEPT)
         self._read = -1
@@ -117,13 +118,16 @@ class Correcting:
         n, self.trouble = points[0].size, trouble
         numbers = np.arange(first, first + n)[-_KEPT:]
         self._numbers[numbers % _KEPT] = numbers
-        self._wanted_um[numbers % _KEPT] = points[0][-_KEPT:]
+        self._wanted_um[numbers % _KEPT], self._flagged[numbers % _KEPT] = points[0][-_KEPT:], False
         point = points[0][:1], points[1][:1], points[2][:1]
         before, self._model = self._model, model
-        if before is not None and before is not model and self.integral_V and before.memory_size == memory.size:
-            changed_V = model.feedforward(*point, memory).u_V.item(0) - before.feedforward(*point, memory).u_V.item(0)
-            if math.isfinite(changed_V) and self.correction is not None:
-                self.correction.hand_over(changed_V)
+        if self.correction is not None:
+            if before is not None and before is not model and before.memory_size == memory.size:
+                changed_V = (model.feedforward(*point, memory).u_V - before.feedforward(*point, memory).u_V).item(0)
+                if math.isfinite(changed_V):
+                    self.correction.hand_over(changed_V, point[1].item(0))
+            for _ in range(n):
+                self.correction.let_in()
         u_V, std_V = answer
         if self.trouble or not self.on:
             self._readings.clear()
@@ -161,6 +165,8 @@ class Correcting:
             if repetition is not None:
                 repetition.read(seq, wanted_um - read_um)
             if correction is not None and not (repetition is not None and repetition.active):
+                if self._flagged.item(seq % _KEPT):
+                    wanted_um = math.nan  # not what the model has answered
                 correction.take(wanted_um - read_um, (wanted_um - self._asked(seq - 1)) / self._dt_s)
         self._readings.clear()
         for name, each in self._each.items():
@@ -190,9 +196,11 @@ class Correcting:
         return min(self._most_V, _SIGMA * std_V) if std_V == std_V else 0.0
 
     def leave_out(self, first: int, flags: NDArray[Any]) -> None:
-        """Of the (n,) points from sample ``first`` on, leave out those that were answered with flags."""
-        flagged = first + np.flatnonzero(flags)[-_KEPT:]
-        self._wanted_um[flagged % _KEPT] = math.nan
+        """Of the (n,) points from sample ``first`` on, leave out of the integral those that were answered with flags.
+
+        What repeats is learnt from them too: from the voltage that they got, whatever it came of.
+        """
+        self._flagged[(first + np.arange(len(flags)))[-_KEPT:] % _KEPT] = np.asarray(flags)[-_KEPT:] != 0
 
     def _asked(self, seq: int) -> float:
         """What was asked for at sample ``seq``, µm; NaN where that is not known, or another than the model answered."""

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks import foreign
-from benchmarks.foreign_motions import HEAD, fits, planned, run_motion, table
+from benchmarks.foreign_motions import HEAD, fits, planned, repetition_table, run_motion, table
 from benchmarks.records import read_lines
 from tests.foreign.plants import random_plant, with_traits
 
@@ -78,6 +78,15 @@ def test_runs_are_added_to_the_file_and_tabulated_with_it(tmp_path: Path, capsys
     assert sum(records[1]["verdicts"].values()) == pytest.approx(10_000, abs=10)
     assert foreign.main(["--table", str(file)]) == 0
     assert len(cells(capsys.readouterr().out)) == 2
+
+
+def test_motions_that_are_followed_with_the_repetition_have_a_table() -> None:
+    followed = {"followed_pct": 1.0, "repeated_pct": 0.25}
+    told = repetition_table([run("raster:5", 1) | followed, run("hold", 1)])
+    (row,) = cells(told)[-1:]
+    assert (row[0], row[1], row[4]) == ("raster:5", "1", "0.250 / 0.250")
+    assert row[5] == "0.25 / 0.25"
+    assert not repetition_table([run("hold", 1)])
 
 
 def test_a_run_that_raises_says_why_and_an_unknown_motion_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -624,7 +624,7 @@ class Corrected:
 
 
 def corrected_by_integral() -> Corrected:
-    """A slow way up, and rest: readings that are late, doubted, missing, or oscillate; a new model, and a trouble."""
+    """A slow way up, and rest: readings that are late, doubted, missing, or oscillate; new models; a trouble."""
     k = np.arange(1200)
     y = np.where(k < 700, 40.0 + 0.01 * k, 47.0)
     noise_um = 0.003 * (k * 7919 % 13 - 6) / 6.0
@@ -638,7 +638,7 @@ def corrected_by_integral() -> Corrected:
         read_um += 0.2 * (1.0 if k % 20 < 10 else -1.0) if 500 <= k < 680 else 0.0
         return seen, read_um
 
-    changes = {400: "lssvm-jumped", 1100: "lssvm-troubled"}
+    changes = {400: "lssvm-jumped", 900: "lssvm", 1000: "lssvm-jumped", 1100: "lssvm-troubled"}
     return Corrected("lssvm", y, np.where(k < 700, 10.0, 0.0), reading, changes)
 
 

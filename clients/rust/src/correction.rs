@@ -148,6 +148,7 @@ pub struct Integral {
     before_um: f64,
     readings: f64,
     speed: f64,
+    held_v: f64,
     watch: Oscillation,
     quiet_s: f64,
     waited_s: f64,
@@ -202,7 +203,7 @@ impl Integral {
         let alpha = dt_s / (dt_s + filter_s);
         self.filtered_um += alpha * (residual_um - self.filtered_um);
         let mut error_um = self.filtered_um;
-        if speed_um_per_s.abs() * (filter_s + self.designed.0 as f64 * dt_s) < self.noise_um {
+        if self.at_rest(speed_um_per_s) {
             // At rest: what the noise explains would only make the stage jitter.
             let dead_um = DEAD_SIGMA * self.noise_um * (alpha / (2.0 - alpha)).sqrt();
             error_um -= error_um.max(-dead_um).min(dead_um);
@@ -218,10 +219,27 @@ impl Integral {
         self.added.u_v = u_v.max(-bound_v).min(bound_v);
     }
 
-    /// Give up what a new model has taken over: its voltage is by `taken_v` above that of the one before.
-    fn hand_over(&mut self, taken_v: f64) {
+    /// Give up what a new model has taken over: its voltage is by `taken_v` above that of the one before. At rest the
+    /// voltage stays, and `let_in` the rest of the change: a model changes with noise.
+    fn hand_over(&mut self, taken_v: f64, speed_um_per_s: f64) {
         let left_v = self.added.u_v - taken_v;
         self.added.u_v = left_v.max(self.added.u_v.min(0.0)).min(self.added.u_v.max(0.0));
+        if self.at_rest(speed_um_per_s) {
+            self.held_v += left_v - self.added.u_v;
+            self.added.u_v = left_v;
+        }
+    }
+
+    /// Once for each point: let in of a new model what is held back, as fast as the low-pass of the readings.
+    fn let_in(&mut self) {
+        let part_v = self.held_v * self.dt_s / (self.dt_s + self.loop_.1);
+        self.held_v -= part_v;
+        self.added.u_v -= part_v;
+    }
+
+    /// Whether the way within low-pass and age is less than the noise.
+    fn at_rest(&self, speed_um_per_s: f64) -> bool {
+        speed_um_per_s.abs() * (self.loop_.1 + self.designed.0 as f64 * self.dt_s) < self.noise_um
     }
 
     /// Keep the correction for one sample without a reading; after `fade_s` of them in a row let it go.
@@ -240,6 +258,7 @@ impl Integral {
         }
         self.added.u_v = (self.added.u_v.abs() - self.fade_v).max(0.0).copysign(self.added.u_v);
         (self.filtered_um, self.before_um) = (0.0, f64::NAN);
+        self.held_v = 0.0;
     }
 
     /// Halve the gain once an oscillation lasts that is as fast as the loop or faster.
@@ -284,6 +303,7 @@ pub struct Correcting {
     most_v: f64,
     dt_s: f64,
     wanted_um: Vec<f64>,
+    flagged: Vec<bool>,
     numbers: Vec<i64>,
     readings: VecDeque<(i64, f64)>,
     read: i64,
@@ -319,6 +339,7 @@ impl Correcting {
             most_v: integral.map_or(0.0, |settings| settings.share * drive_v),
             dt_s,
             wanted_um: vec![f64::NAN; KEPT],
+            flagged: vec![false; KEPT],
             numbers: vec![-1; KEPT],
             readings: VecDeque::with_capacity(KEPT),
             read: -1,
@@ -364,7 +385,7 @@ impl Correcting {
         for (k, y) in y_um.iter().enumerate() {
             let number = self.number + k as i64;
             let at = number as usize % KEPT;
-            (self.numbers[at], self.wanted_um[at]) = (number, *y);
+            (self.numbers[at], self.wanted_um[at], self.flagged[at]) = (number, *y, false);
         }
         if troubled || !self.on {
             self.readings.clear();
@@ -385,6 +406,9 @@ impl Correcting {
     /// Add the corrections to the model's voltages `u_v`, V, for the next points; `std_v`: deviation that it states for
     /// the first one, V. `troubled`: as for `ask`.
     pub(crate) fn correct(&mut self, y_um: &[f64], u_v: &mut [f64], std_v: f64, troubled: bool) {
+        if let Some(integral) = &mut self.integral {
+            u_v.iter().for_each(|_| integral.let_in());
+        }
         if troubled || !self.on {
             self.integral.iter_mut().for_each(Integral::release);
             self.repetition.iter_mut().for_each(Repetition::release);
@@ -421,11 +445,14 @@ impl Correcting {
             repetition.set(self.age, slope, lag_s);
         }
         while let Some((number, read_um)) = self.readings.pop_front() {
-            let (wanted_um, before_um) = (self.asked(number), self.asked(number - 1));
+            let (mut wanted_um, before_um) = (self.asked(number), self.asked(number - 1));
             let mut repeats = false;
             if let Some(repetition) = &mut self.repetition {
                 repetition.read(number, wanted_um - read_um);
                 repeats = repetition.active;
+            }
+            if self.flagged[number.rem_euclid(KEPT as i64) as usize] {
+                wanted_um = f64::NAN; // not what the model has answered
             }
             if let Some(integral) = self.integral.as_mut().filter(|_| !repeats) {
                 integral.take(wanted_um - read_um, (wanted_um - before_um) / self.dt_s);
@@ -433,14 +460,13 @@ impl Correcting {
         }
     }
 
-    /// Take what the points got in the end, V; readings of those with flags are no residual.
+    /// Take what the points got in the end, V. The readings of those with flags are left out of the integral; what
+    /// repeats is learnt from them too: from the voltage that they got, whatever it came of.
     pub(crate) fn answered(&mut self, u_v: &[f64], flags: &[u8]) {
         let integral_v = self.integral_v();
         for (k, (u_v, flags)) in u_v.iter().zip(flags).enumerate() {
             let number = self.number + k as i64;
-            if *flags != 0 {
-                self.wanted_um[number as usize % KEPT] = f64::NAN;
-            }
+            self.flagged[number as usize % KEPT] = *flags != 0;
             if let Some(repetition) = &mut self.repetition {
                 repetition.applied(number, u_v - integral_v);
             }
@@ -457,9 +483,9 @@ impl Correcting {
     }
 
     /// A new model gives a voltage that is by `changed_v` above that of the one before.
-    pub(crate) fn hand_over(&mut self, changed_v: f64) {
+    pub(crate) fn hand_over(&mut self, changed_v: f64, speed_um_per_s: f64) {
         if let Some(integral) = self.integral.as_mut().filter(|_| changed_v.is_finite()) {
-            integral.hand_over(changed_v);
+            integral.hand_over(changed_v, speed_um_per_s);
         }
     }
 

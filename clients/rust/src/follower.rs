@@ -248,9 +248,9 @@ impl Follower {
         if newest.snapshot.memory.len() != self.memory.len() {
             std::mem::swap(&mut self.memory, &mut newest.snapshot.room);
         } else if let (Some(next), Some(correcting)) = (next, &mut self.correcting) {
-            if correcting.integral_v() != 0.0 && next.iter().all(|value| value.is_finite()) {
+            if correcting.integral.is_some() && next.iter().all(|value| value.is_finite()) {
                 let before = voltage_at(&mut self.current.snapshot, &self.memory, next).0;
-                correcting.hand_over(voltage_at(&mut newest.snapshot, &self.memory, next).0 - before);
+                correcting.hand_over(voltage_at(&mut newest.snapshot, &self.memory, next).0 - before, next[1]);
             }
         }
         let old = std::mem::replace(&mut self.current, newest);

@@ -171,11 +171,11 @@ def test_a_bound_that_readings_beyond_it_have_raised_is_not_used() -> None:
 def test_what_a_model_takes_over_leaves_the_correction() -> None:
     correction = made()
     carried_V = in_motion(correction, 0.1, 200)
-    correction.hand_over(0.25 * carried_V)
+    correction.hand_over(0.25 * carried_V, math.inf)
     assert correction.u_V == pytest.approx(0.75 * carried_V)
-    correction.hand_over(-carried_V)  # the model has gone the other way: that is not resisted
+    correction.hand_over(-carried_V, math.inf)  # the model has gone the other way: that is not resisted
     assert correction.u_V == pytest.approx(0.75 * carried_V)
-    correction.hand_over(2.0 * carried_V)
+    correction.hand_over(2.0 * carried_V, math.inf)
     assert correction.u_V == 0.0
 
 
@@ -282,3 +282,26 @@ def test_slope_and_lag_are_those_of_the_branch_on_which_the_stage_moves() -> Non
 def test_impossible_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"{name}: got {value}"):
         Correction(**{"dt_s": 1e-3, "mode_Hz": 200.0, "fade_s": 0.5, name: value})
+
+
+@pytest.mark.parametrize("taken_V", [0.3, -0.2])
+def test_at_rest_a_new_model_comes_gradually_and_in_motion_at_once(taken_V: float) -> None:
+    def at(speed_um_per_s: float) -> list[float]:
+        one, rng = Correction(1e-3, 200.0, 0.5), np.random.default_rng(1)
+        one.set(1, 1.0, 0.0, 1.0)
+        for _ in range(50):
+            one.take(0.01 * rng.standard_normal(), speed_um_per_s)
+        before_V = one.u_V
+        one.hand_over(taken_V, speed_um_per_s)
+        total_V = [taken_V + one.u_V - before_V]
+        for k in range(500):
+            one.let_in()  # whatever comes of the readings
+            one.take(0.01 * rng.standard_normal() if k > 400 else math.nan, speed_um_per_s)
+            total_V.append(taken_V + one.u_V - before_V)
+        return total_V
+
+    resting = at(0.0)
+    assert abs(resting[0]) < 1e-12
+    assert np.abs(np.diff(resting)).max() < 0.5 * abs(taken_V)
+    assert resting[-1] == pytest.approx(taken_V, abs=0.02)
+    assert at(100.0)[0] == pytest.approx(taken_V, abs=0.05)

@@ -175,7 +175,7 @@ class Loop:
         return np.array([np.mean(part) for part in np.array_split(errors[: round(n * self.period)], n)])
 
 
-@pytest.mark.parametrize("period", [40.0, 66.6667, 200.0])
+@pytest.mark.parametrize("period", [25.25, 40.0, 66.6667, 200.0])
 @pytest.mark.parametrize("age", [1, 5, 20])
 def test_what_repeats_is_gone_after_some_passes(period: float, age: int) -> None:
     loop = Loop(period, age)

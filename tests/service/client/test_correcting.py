@@ -17,6 +17,7 @@ from dehyst.service.client.follower import Follower
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.model import ModelMessage, Safety, decode_model, encode_model
+from dehyst.service.protocol.query import OUTSIDE_DOMAIN
 from tests.service.conftest import make_models
 
 DT_S = 1e-3
@@ -112,6 +113,25 @@ def test_where_the_voltage_was_limited_a_reading_says_nothing() -> None:
         one.point(40.0, seq=k + 1)
     assert one.correcting.correction.u_V == before_V
     assert one.correcting.correction.doubted == doubted + 50
+
+
+def test_points_with_flags_teach_what_repeats_and_not_the_integral() -> None:
+    one = Correcting(CONFIG, LIMITS, DT_S, RepetitionConfig(on=True, mode_Hz=200.0))
+    memory, zero = MODEL.rest_memory(40.0), np.zeros(1)
+    assert one.repetition is not None
+    assert one.correction is not None
+    one.repetition.state(0.05)
+    for k in range(500):
+        y_um = 40.0 + math.sin(2.0 * math.pi * k / 50.0)
+        if k:
+            one.read(k - 1, 40.0 + 0.98 * math.sin(2.0 * math.pi * (k - 1) / 50.0))
+        one.voltage(k, MODEL, (np.array([y_um]), zero, zero), memory, (np.array([y_um]), 1.0))
+        one.applied(k, np.array([y_um + one.repetition.u_V]))
+        one.leave_out(k, np.full(1, OUTSIDE_DOMAIN))
+    assert one.repetition.active
+    assert one.repetition.doubted == 0
+    assert one.correction.doubted > 0
+    assert (one.correction.u_V, abs(one.repetition.u_V) > 0.0) == (0.0, True)
 
 
 @pytest.mark.parametrize("bad", [math.nan, 39.0])
