@@ -62,13 +62,18 @@ class Delay(CauseModel):
     unseen_is_absent: bool = True
     fast: bool = True
     pins: tuple[str, ...] = ("latch_samples",)
+    #: Without a frequency response, a delay shows only its sum with the stage's own lag (`Late`).
+    told: bool = True
+
+    def missing(self, data: FitData) -> str:
+        return "" if self.told else "a frequency response"
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt = data.dt_s
         return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 20.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
 
     def shown(self, readings: Readings) -> CauseModel:
-        return self if has_response(readings) else Late(self.name)
+        return replace(self, told=has_response(readings))
 
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A voltage that runs straight to the next sample in place of being held moves it by so much.
@@ -83,11 +88,11 @@ class Delay(CauseModel):
 
 @dataclass(frozen=True)
 class Late(CauseModel):
-    """Readings that are later than the nominal stage may be, in motion too slow to show by what.
+    """Readings that are later than the nominal stage may be: its latch stands at its upper bound.
 
-    Lag, delay and the stage's own lag show only their sum there. So the stage's own lag and latch keep their neutral
-    values, and ``tau_s`` is the lateness beside them. ``most_s``: lateness of a nominal stage whose lag and latch both
-    stand at their upper bounds; 0 where they do not, and then nothing is later than it may be.
+    In motion too slow for a frequency response, lag, delay and the stage's own lag show only their sum. There its lag
+    stands at its bound as well; lag and latch keep their neutral values, and ``tau_s`` is the lateness beside them.
+    ``most_s``: lateness of a nominal stage at its bounds; 0 where it is not, and then nothing is later than it may be.
     """
 
     variant: str = "late"
@@ -95,6 +100,9 @@ class Late(CauseModel):
     widens: bool = True
     pins: tuple[str, ...] = ("tau_s", "latch_samples")
     most_s: float = 0.0
+
+    def shown(self, readings: Readings) -> CauseModel:
+        return replace(self, pins=("latch_samples",)) if has_response(readings) else self
 
     def missing(self, data: FitData) -> str:
         return "" if self.most_s else "a lateness that the nominal stage may not have"
@@ -107,8 +115,8 @@ class Late(CauseModel):
         ends = [own[name] for name in self.pins if name in own]
         if len(ends) < len(self.pins) or any(value < s.high - 0.02 * s.step for s, value in ends):
             return replace(self, most_s=0.0)
-        (lag, tau_s), (_, latch) = ends
-        return replace(self, most_s=tau_s - lag.neutral + latch * data.dt_s)
+        most_s = sum((value - s.neutral) * (1.0 if s.unit == "s" else data.dt_s) for s, value in ends)
+        return replace(self, most_s=most_s)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt_s = data.dt_s
@@ -157,7 +165,7 @@ DELAY = Kind(
     source="0.1 to 2 ms of converters and buses (common knowledge of the field)",
     cause=Cause(
         sign="a straight part of the phase over frequency, beyond a sample",
-        forms=(Delay(),),
+        forms=(Delay(), Late()),
         tests=(seen,),
         in_library=same_numbers("delay", delay_s="tau_s"),
         picture=pictures.after_steps,
