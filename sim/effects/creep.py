@@ -151,7 +151,7 @@ def in_cycles(readings: Readings) -> Sight:
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    either = found.moved and not (found.creeps or found.goes_on)
+    either = found.moved is True and not (found.creeps or found.goes_on)
     return Sight(True if found.creeps or either else None, found.mean_words, ("thermal_drift",) if either else ())
 
 

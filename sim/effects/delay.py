@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from dehyst.sim.effects.sampled_lags import has_response, lags_of_response
 from dehyst.sim.fitting.dynamics import Dynamics
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
@@ -132,13 +134,25 @@ class Late(CauseModel):
 
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A lag's readings are half a sample earlier than its time constant says.
-        return {"tau_s": 0.5 * data.dt_s}
+        return {"tau_s": 0.5 * data.dt_s + self.own_s}
+
+    @property
+    def own_s(self) -> float:
+        """Half of the lateness that may be the stage's own: all or nothing of it, where only the sum shows."""
+        return 0.5 * self.most_s if len(self.pins) > 1 else 0.0
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        return {"tau_s": (float(p[0]) - self.own_s, np.ones(1))}
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return single_guesses([self.most_s + f * data.dt_s for f in (0.3, 1.0, 2.0, 4.0)])
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return replace(system, delay_s=float(p[0]))
+
+
+def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    return InLibrary((DELAY.clipped(delay_s=float(p[0])),))
 
 
 # Its signature in the readings.
@@ -167,7 +181,7 @@ DELAY = Kind(
         sign="a straight part of the phase over frequency, beyond a sample",
         forms=(Delay(), Late()),
         tests=(seen,),
-        in_library=same_numbers("delay", delay_s="tau_s"),
+        in_library=in_library,
         picture=pictures.after_steps,
     ),
 )

@@ -195,15 +195,16 @@ class CyclesOverTime:
     """What equal cycles show. ``missing``: what they lack to show anything; then nothing else is given.
 
     ``course``: times (s) and means (µm) over one period, (m,) each; empty where other motion lies between the cycles.
-    ``grew``: their height changes in time (None: it settles). ``moved``: their mean does, ``creeps`` clearly with the
-    logarithm of time, ``goes_on`` clearly in another way. ``also``: what a change in time may be as well.
+    ``grew``: their height changes in time, by what is usual (None: by less, or it settles). ``moved``: their mean does,
+    ``creeps`` clearly with the logarithm of time, ``goes_on`` clearly in another way. ``also``: what a change in time
+    may be as well.
     """
 
     missing: str
     height_words: str = ""
     grew: bool | None = None
     mean_words: str = ""
-    moved: bool = False
+    moved: bool | None = False
     creeps: bool = False
     goes_on: bool = False
     also: tuple[str, ...] = ()
@@ -242,17 +243,19 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
         means_um -= relative * float(np.clip(level_um, -data.range_um, data.range_um))
     shift, shift_error = _slope(t, means_um)
     span = float(t[-1] - t[0])
-    gained = abs(change * span) > USUAL and abs(change) > _SIGMAS * error
+    grew = abs(change * span) if abs(change) > _SIGMAS * error else 0.0
+    gained = _beyond(grew, 3e-4, USUAL)
     since = np.log10(t - same[0].start * data.dt_s + (t[1] - t[0]))
-    settles = gained and _misfit(since, relative) < 0.9 * _misfit(t, relative)
+    settles = bool(gained) and _misfit(since, relative) < 0.9 * _misfit(t, relative)
     # A drift is a line or settles exponentially, creep goes with the logarithm; a mean that follows neither wanders.
     drift = min(_misfit(t, means_um), *(_misfit(np.exp(-t / (share * span)), means_um) for share in _SETTLES))
     creep, white = _misfit(since, means_um), float(np.sum(np.square(np.diff(means_um, n=2)))) / 6.0
     wanders = min(drift, creep) > _CLEARLY * white
     varies = abs(shift) > _SIGMAS * shift_error or _misfit(0.0 * t, means_um) > _CLEARLY * white
-    moved = varies and float(np.ptp(means_um)) > max(2.0 * readings.sigma_um, USUAL * data.range_um)
-    creeps = moved and drift > _CLEARLY * (creep + white)
-    goes_on = moved and (creep > _CLEARLY * (drift + white) or wanders)
+    way_um, sigma_um = float(np.ptp(means_um)) if varies else 0.0, readings.sigma_um
+    moved = _beyond(way_um, max(sigma_um, 1e-4 * data.range_um), max(2.0 * sigma_um, USUAL * data.range_um))
+    creeps = bool(moved) and drift > _CLEARLY * (creep + white)
+    goes_on = bool(moved) and (creep > _CLEARLY * (drift + white) or wanders)
     n = len(same)
     per_decade, per_decade_error = _slope(since, means_um)
     manner = "the logarithm of time" if creeps else "time" if goes_on else "time or its logarithm"
@@ -274,6 +277,11 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     settled = creeps and abs(per_decade) > 5.0 * per_decade_error
     words = height_words, None if settles else gained, mean_words
     return CyclesOverTime("", *words, moved, settled, goes_on, also, _course(readings, same))
+
+
+def _beyond(size: float, least: float, usual: float) -> bool | None:
+    """Whether a change is as large as usual; None where it is smaller, and more than nothing."""
+    return True if size > usual else None if size > least else False
 
 
 def _course(readings: Readings, same: list[Cycle]) -> tuple[FloatArray, FloatArray]:

@@ -39,10 +39,10 @@ def test_a_lateness_that_the_nominal_stage_may_not_have_is_named_with_its_size(l
         return
     (found,) = lags
     assert {found.name, *found.alternatives} == LAGS
-    # The stage's own lag of 2.5 ms keeps its share.
+    # The stage's own lateness is between that of its neutral lag and the 6.5 ms more that it may have.
     low, high = found.intervals["tau_s"]
-    assert low <= late_s - 2.53e-3 <= high
-    assert high - low < 0.015
+    assert low <= late_s - 9e-3 < late_s - 2.53e-3 <= high
+    assert high - low < 0.02
 
 
 def test_what_shows_only_a_sum_is_fitted_as_a_sum() -> None:
