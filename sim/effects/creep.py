@@ -8,10 +8,11 @@ in closed form.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
@@ -60,12 +61,30 @@ _POLES = LastResultCache()
 
 @dataclass(frozen=True)
 class Creep(CauseModel):
-    """A sum of slow first-order lags, 0.05 s to beyond the record, 0.6 decades apart. Equal weights give log t."""
+    """A sum of slow first-order lags, 0.05 s to beyond the record, 0.6 decades apart.
+
+    Equal weights give log t; a line of weights over log tau is close to a power of t, and a parabola closer. With a
+    weight of its own a fast lag would stand for a lag of the stage or for a part of the loop.
+    """
 
     unseen_is_absent: bool = True
     imitates_others: bool = True
     model_error: float = 0.04
     spacing: float = 0.6  # decades between the poles
+    #: Numbers of the weights: 2 for a line, 3 for a parabola.
+    terms: int = 2
+
+    def weights(self, p: FloatArray, data: FitData) -> FloatArray:
+        """(m,) weight of each lag."""
+        return np.asarray(p[: self.terms] @ self._shapes(data))
+
+    def _shapes(self, data: FitData) -> FloatArray:
+        """(terms, m) weights of each lag for a unit of each number."""
+        return np.asarray(legvander(np.linspace(-1.0, 1.0, self.taus_s(data).size), self.terms - 1).T)
+
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        finer = left_floors > 1.1 and self.terms == 2
+        return (replace(self, terms=3), [np.insert(p, 2, 0.0)]) if finer else None
 
     def taus_s(self, data: FitData) -> FloatArray:
         top = data.slowest_s
@@ -76,28 +95,29 @@ class Creep(CauseModel):
         return "" if data.duration_s > 1.0 else "a record longer than a second"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return 5e-4 <= self.reported(p, data)["gain_per_decade"][0] <= 0.08
+        all_rise = float(np.min(self.weights(p, data))) >= -1e-3 * float(p[0])
+        return all_rise and 5e-4 <= self.reported(p, data)["gain_per_decade"][0] <= 0.08
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         r = data.range_um
-        weights = [
-            ModelParameter(f"weight{j + 1}", "1", 0.0, 0.0, 0.1, 0.005, ActsOn.MOTION, True)
-            for j in range(self.taus_s(data).size)
-        ]
         # Creep goes on from a step just before the recording, and from motion long before it.
         long_um = 0.0 if data.begins_at_rest else r
         return (
-            *weights,
+            ModelParameter("weight", "1", 0.0, 0.0, 0.1, 0.005, ActsOn.MOTION, True),
+            *(
+                ModelParameter(name, "1", 0.0, -0.1, 0.1, 0.005, ActsOn.MOTION, True)
+                for name in ("weight_tilt", "weight_bend")[: self.terms - 1]
+            ),
             ModelParameter("start_um", "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION),
             ModelParameter("before_um", "µm", 0.0, -long_um, long_um, 0.05 * r, ActsOn.MOTION),
         )
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        return [trial[: self.taus_s(data).size] for trial in super().guesses(data, residual_um)]
+        return [trial[: self.terms] for trial in super().guesses(data, residual_um)]
 
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         taus = self.taus_s(data)
-        weights, starts = p[: taus.size], p[taus.size :]
+        weights, starts = self.weights(p, data), p[self.terms :]
         if not np.any(weights):
             return x_um
         rates = data.dt_s / taus
@@ -115,8 +135,8 @@ class Creep(CauseModel):
         t = np.logspace(-1.0, np.log10(max(data.slowest_s / 6.0, 0.3)), 60)
         rise = 1.0 - np.exp(-t[None, :] / taus[:, None])
         x = np.log10(t) - np.log10(t).mean()
-        row = rise @ x / float(x @ x)
-        row = np.append(row, np.zeros(p.size - taus.size))
+        each = rise @ x / float(x @ x)
+        row = np.append(self._shapes(data) @ each, np.zeros(p.size - self.terms))
         return {"gain_per_decade": (float(row @ p), row)}
 
 
@@ -145,7 +165,7 @@ def in_cycles(readings: Readings) -> Sight:
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    either = found.moved and not (found.creeps or found.goes_on)
+    either = found.moved is True and not (found.creeps or found.goes_on)
     return Sight(True if found.creeps or either else None, found.mean_words, ("thermal_drift",) if either else ())
 
 

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim import pictures
-from dehyst.sim.effects.base import Cause, Context, Kind, Parameter, Place, block, same_numbers
+from dehyst.sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from dehyst.sim.effects.sampled_lags import has_response, lags_of_response
 from dehyst.sim.fitting.dynamics import Dynamics
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
@@ -62,13 +64,18 @@ class Delay(CauseModel):
     unseen_is_absent: bool = True
     fast: bool = True
     pins: tuple[str, ...] = ("latch_samples",)
+    #: Without a frequency response, a delay shows only its sum with the stage's own lag (`Late`).
+    told: bool = True
+
+    def missing(self, data: FitData) -> str:
+        return "" if self.told else "a frequency response"
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt = data.dt_s
         return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 20.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
 
     def shown(self, readings: Readings) -> CauseModel:
-        return self if has_response(readings) else Late(self.name)
+        return replace(self, told=has_response(readings))
 
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A voltage that runs straight to the next sample in place of being held moves it by so much.
@@ -83,11 +90,11 @@ class Delay(CauseModel):
 
 @dataclass(frozen=True)
 class Late(CauseModel):
-    """Readings that are later than the nominal stage may be, in motion too slow to show by what.
+    """Readings that are later than the nominal stage may be: its latch stands at its upper bound.
 
-    Lag, delay and the stage's own lag show only their sum there. So the stage's own lag and latch keep their neutral
-    values, and ``tau_s`` is the lateness beside them. ``most_s``: lateness of a nominal stage whose lag and latch both
-    stand at their upper bounds; 0 where they do not, and then nothing is later than it may be.
+    In motion too slow for a frequency response, lag, delay and the stage's own lag show only their sum. There its lag
+    stands at its bound as well; lag and latch keep their neutral values, and ``tau_s`` is the lateness beside them.
+    ``most_s``: lateness of a nominal stage at its bounds; 0 where it is not, and then nothing is later than it may be.
     """
 
     variant: str = "late"
@@ -95,6 +102,9 @@ class Late(CauseModel):
     widens: bool = True
     pins: tuple[str, ...] = ("tau_s", "latch_samples")
     most_s: float = 0.0
+
+    def shown(self, readings: Readings) -> CauseModel:
+        return replace(self, pins=("latch_samples",)) if has_response(readings) else self
 
     def missing(self, data: FitData) -> str:
         return "" if self.most_s else "a lateness that the nominal stage may not have"
@@ -107,8 +117,8 @@ class Late(CauseModel):
         ends = [own[name] for name in self.pins if name in own]
         if len(ends) < len(self.pins) or any(value < s.high - 0.02 * s.step for s, value in ends):
             return replace(self, most_s=0.0)
-        (lag, tau_s), (_, latch) = ends
-        return replace(self, most_s=tau_s - lag.neutral + latch * data.dt_s)
+        most_s = sum((value - s.neutral) * (1.0 if s.unit == "s" else data.dt_s) for s, value in ends)
+        return replace(self, most_s=most_s)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         dt_s = data.dt_s
@@ -124,13 +134,25 @@ class Late(CauseModel):
 
     def unresolved(self, data: FitData) -> dict[str, float]:
         # A lag's readings are half a sample earlier than its time constant says.
-        return {"tau_s": 0.5 * data.dt_s}
+        return {"tau_s": 0.5 * data.dt_s + self.own_s}
+
+    @property
+    def own_s(self) -> float:
+        """Half of the lateness that may be the stage's own: all or nothing of it, where only the sum shows."""
+        return 0.5 * self.most_s if len(self.pins) > 1 else 0.0
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        return {"tau_s": (float(p[0]) - self.own_s, np.ones(1))}
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return single_guesses([self.most_s + f * data.dt_s for f in (0.3, 1.0, 2.0, 4.0)])
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return replace(system, delay_s=float(p[0]))
+
+
+def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    return InLibrary((DELAY.clipped(delay_s=float(p[0])),))
 
 
 # Its signature in the readings.
@@ -157,9 +179,9 @@ DELAY = Kind(
     source="0.1 to 2 ms of converters and buses (common knowledge of the field)",
     cause=Cause(
         sign="a straight part of the phase over frequency, beyond a sample",
-        forms=(Delay(),),
+        forms=(Delay(), Late()),
         tests=(seen,),
-        in_library=same_numbers("delay", delay_s="tau_s"),
+        in_library=in_library,
         picture=pictures.after_steps,
     ),
 )

@@ -17,7 +17,7 @@ from dehyst.sim.effects.slow_change import SlowChange
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from dehyst.sim.fitting.stage_model import CauseModel, Guess
 from dehyst.sim.readings.sight import Sight
-from dehyst.sim.readings.slow_motion import cycles_over_time, rests_over_time
+from dehyst.sim.readings.slow_motion import USUAL, cycles_over_time, rests_over_time
 
 if TYPE_CHECKING:
     from dehyst.sim.readings.readings import Readings
@@ -109,7 +109,7 @@ def in_rests(readings: Readings) -> Sight:
         return Sight(None, "all rests are at one voltage")
     v, e = found.gain.value, found.gain.error
     words = f"the rests move by {100.0 * v:.3g} ± {1.96 * 100.0 * e:.1g} % of the motion {found.gain.when}"
-    return Sight(found.gain.seen(abs(v), 5e-4, 2e-3), words)
+    return Sight(found.gain.seen(abs(v), 5e-4, USUAL), words)
 
 
 def in_cycles(readings: Readings) -> Sight:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from dehyst.sim.effects.slow_change import SlowChange
 from dehyst.sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from dehyst.sim.fitting.stage_model import CauseModel
 from dehyst.sim.readings.sight import Sight
-from dehyst.sim.readings.slow_motion import cycles_over_time, rests_over_time
+from dehyst.sim.readings.slow_motion import USUAL, cycles_over_time, rests_over_time
 
 if TYPE_CHECKING:
     from dehyst.sim.readings.readings import Readings
@@ -73,11 +73,60 @@ class ThermalDrift(SlowChange):
             return super().reported(p, data)
         rate = np.zeros(p.size)
         rate[-1] = 1.0 / data.duration_s
-        return {"rate_um_per_s": (float(rate @ p), rate)}
+        # A drift that comes back has no rate.
+        most = np.zeros(p.size)
+        most[int(np.argmax(np.abs(p)))] = 1.0
+        return {"rate_um_per_s": (float(rate @ p), rate), "largest_um": (float(most @ p), most)}
+
+
+#: Least share of the record that equal cycles cover whose means are the course of a drift.
+_COVERED = 0.8
+
+
+@dataclass(frozen=True)
+class Wander(CauseModel):
+    """A drift of any course: that of the means of equal cycles, in straight lines, times a share of about 1.
+
+    A spline of a few knots does not follow a walk, and one of many says nothing of a stretch that is held out.
+    """
+
+    variant: str = "cycles"
+    unseen_is_absent: bool = True
+    imitates_others: bool = True
+    of_one_recording: bool = True
+    times_s: tuple[float, ...] = ()
+    means_um: tuple[float, ...] = ()
+
+    def shown(self, readings: Readings) -> Wander:
+        times_s, means_um = readings.once(cycles_over_time).course
+        covered = times_s.size > 0 and np.ptp(times_s) > _COVERED * readings.data.duration_s
+        return replace(self, times_s=tuple(times_s), means_um=tuple(means_um - means_um[0])) if covered else self
+
+    def missing(self, data: FitData) -> str:
+        return "" if self.times_s else "equal cycles over most of the record"
+
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
+        return 0.7 < float(p[0]) < 1.3
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return (ModelParameter("share", "1", 0.0, 0.0, 2.0, 0.1, ActsOn.MOTION, True),)
+
+    def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        course = data.derived((self.times_s, self.means_um), lambda: np.interp(data.t_s, self.times_s, self.means_um))
+        return np.asarray(x_um + p[0] * course)
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        rate = np.array([self.means_um[-1] / data.duration_s])
+        most = np.array([max(self.means_um, key=abs)])
+        return {"rate_um_per_s": (float(rate @ p), rate), "largest_um": (float(most @ p), most)}
+
+    def unresolved(self, data: FitData) -> dict[str, float]:
+        # Before the first mean and behind the last one it may move as between two others.
+        return {"rate_um_per_s": float(np.max(np.abs(np.diff(self.means_um)))) / data.duration_s}
 
 
 def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
-    ramp = 60.0 * float(p[-1]) / data.duration_s if form.variant != "temperature" else 0.0
+    ramp = 60.0 * form.reported(p, data)["rate_um_per_s"][0] if form.variant != "temperature" else 0.0
     start = THERMAL_DRIFT.clipped(amplitude_um=1e-3, tau_s=0.3 * data.duration_s, ramp_um_per_min=ramp)
     return InLibrary((start,), refit=True)
 
@@ -93,7 +142,7 @@ def in_rests(readings: Readings) -> Sight:
     v, e = found.shift.value, found.shift.error
     least = max(2.0 * readings.sigma_um, 1e-4 * data.range_um)
     words = f"the rests move by {v:.3g} ± {1.96 * e:.1g} µm {found.shift.when}"
-    return Sight(found.shift.seen(abs(v), least, 2e-3 * data.range_um), words)
+    return Sight(found.shift.seen(abs(v), least, USUAL * data.range_um), words)
 
 
 def in_cycles(readings: Readings) -> Sight:
@@ -126,7 +175,7 @@ THERMAL_DRIFT = Kind(
     cause=Cause(
         sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time, settles "
         "exponentially, or wanders",
-        forms=(ThermalDrift(), ThermalDrift(variant="temperature", of_one_recording=False)),
+        forms=(ThermalDrift(), Wander(), ThermalDrift(variant="temperature", of_one_recording=False)),
         tests=(in_rests, in_cycles),
         in_library=in_library,
         picture=pictures.slowly,

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 _TAUS_S = (0.1, 0.4, 1.6, 6.4, 25.0, 100.0)
 #: Standard errors from which a signature counts as seen.
 _SIGMAS = 3.8
+#: Usual drift over a record, relative to the motion. The means and heights of cycles change by less of it for many
+#: reasons (a loop that settles, a start): they show no smaller one.
+USUAL = 2e-3
 #: Time constants of a drift that settles, in the time that the cycles take.
 _SETTLES = (0.15, 0.3, 0.6, 1.2)
 #: Squared error beside a form, in that beside another form and of neighbouring cycles, that speaks against it.
@@ -191,18 +194,21 @@ def _jackknife(rests: _Rests, end: int | None) -> tuple[dict[str, float], dict[s
 class CyclesOverTime:
     """What equal cycles show. ``missing``: what they lack to show anything; then nothing else is given.
 
-    ``grew``: their height changes in time (None: it settles). ``moved``: their mean does, ``creeps`` clearly with the
-    logarithm of time, ``goes_on`` clearly in another way. ``also``: what a change in time may be as well.
+    ``course``: times (s) and means (µm) over one period, (m,) each; empty where other motion lies between the cycles.
+    ``grew``: their height changes in time, by what is usual (None: by less, or it settles). ``moved``: their mean does,
+    ``creeps`` clearly with the logarithm of time, ``goes_on`` clearly in another way. ``also``: what a change in time
+    may be as well.
     """
 
     missing: str
     height_words: str = ""
     grew: bool | None = None
     mean_words: str = ""
-    moved: bool = False
+    moved: bool | None = False
     creeps: bool = False
     goes_on: bool = False
     also: tuple[str, ...] = ()
+    course: tuple[FloatArray, FloatArray] = (np.empty(0), np.empty(0))
 
 
 def cycles_over_time(readings: Readings) -> CyclesOverTime:
@@ -237,17 +243,19 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
         means_um -= relative * float(np.clip(level_um, -data.range_um, data.range_um))
     shift, shift_error = _slope(t, means_um)
     span = float(t[-1] - t[0])
-    gained = abs(change * span) > 3e-4 and abs(change) > _SIGMAS * error
+    grew = abs(change * span) if abs(change) > _SIGMAS * error else 0.0
+    gained = _beyond(grew, 3e-4, USUAL)
     since = np.log10(t - same[0].start * data.dt_s + (t[1] - t[0]))
-    settles = gained and _misfit(since, relative) < 0.9 * _misfit(t, relative)
+    settles = bool(gained) and _misfit(since, relative) < 0.9 * _misfit(t, relative)
     # A drift is a line or settles exponentially, creep goes with the logarithm; a mean that follows neither wanders.
     drift = min(_misfit(t, means_um), *(_misfit(np.exp(-t / (share * span)), means_um) for share in _SETTLES))
     creep, white = _misfit(since, means_um), float(np.sum(np.square(np.diff(means_um, n=2)))) / 6.0
     wanders = min(drift, creep) > _CLEARLY * white
     varies = abs(shift) > _SIGMAS * shift_error or _misfit(0.0 * t, means_um) > _CLEARLY * white
-    moved = varies and float(np.ptp(means_um)) > max(readings.sigma_um, 1e-4 * data.range_um)
-    creeps = moved and drift > _CLEARLY * (creep + white)
-    goes_on = moved and (creep > _CLEARLY * (drift + white) or wanders)
+    way_um, sigma_um = float(np.ptp(means_um)) if varies else 0.0, readings.sigma_um
+    moved = _beyond(way_um, max(sigma_um, 1e-4 * data.range_um), max(2.0 * sigma_um, USUAL * data.range_um))
+    creeps = bool(moved) and drift > _CLEARLY * (creep + white)
+    goes_on = bool(moved) and (creep > _CLEARLY * (drift + white) or wanders)
     n = len(same)
     per_decade, per_decade_error = _slope(since, means_um)
     manner = "the logarithm of time" if creeps else "time" if goes_on else "time or its logarithm"
@@ -267,7 +275,27 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     if goes_on:
         mean_words += as_creep
     settled = creeps and abs(per_decade) > 5.0 * per_decade_error
-    return CyclesOverTime("", height_words, None if settles else gained, mean_words, moved, settled, goes_on, also)
+    words = height_words, None if settles else gained, mean_words
+    return CyclesOverTime("", *words, moved, settled, goes_on, also, _course(readings, same))
+
+
+def _beyond(size: float, least: float, usual: float) -> bool | None:
+    """Whether a change is as large as usual; None where it is smaller, and more than nothing."""
+    return True if size > usual else None if size > least else False
+
+
+def _course(readings: Readings, same: list[Cycle]) -> tuple[FloatArray, FloatArray]:
+    """Mean over one period (µm) at eight times (s) a period. Where each cycle repeats the last, that of its motion is
+    the same at any phase."""
+    data, period = readings.data, float(np.mean([c.stop - c.start for c in same]))
+    if same[-1].stop - same[0].start > (len(same) + 0.5) * period:
+        return np.empty(0), np.empty(0)
+    index = np.arange(data.n)
+    total = np.append(0.0, np.cumsum(np.interp(index, index[readings.mask], data.y_um[readings.mask])))
+    first = np.arange(same[0].start, same[-1].stop - period, period / 8.0)
+    at = np.arange(data.n + 1)
+    means_um = (np.interp(first + period, at, total) - np.interp(first, at, total)) / period
+    return (first + 0.5 * period) * data.dt_s, means_um
 
 
 def _misfit(t: FloatArray, v: FloatArray) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from dehyst.sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
-from dehyst.sim.diagnosis.search.intervals import across_zero, numbers, parameter_errors
+from dehyst.sim.diagnosis.search.intervals import across_zero, parameter_errors
 from dehyst.sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from dehyst.sim.fitting.calibration import (
     calibrate,
@@ -26,6 +26,7 @@ from dehyst.sim.fitting.calibration import (
     with_free_memory,
     with_new_columns,
 )
+from dehyst.sim.fitting.fit_data import ActsOn
 from dehyst.sim.fitting.parallel import side_by_side
 from dehyst.sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 from dehyst.sim.readings.noise import has_spectral_line
@@ -398,9 +399,10 @@ class Search:
         current = nominal
         for wider in [c for c in self.causes if c.widens and not c.missing(nominal.model.data)]:
             found = self._widened(wider, nominal)
-            gain = held.sse_um2 - found.held.sse_um2
-            if gain <= 0.0 or not self.agreement(found):
+            if self.vetoed(wider) or not self.agreement(found):
                 continue
+            # As long as causes are missing, held-out stretches say little of it: the review decides.
+            gain = held.sse_um2 - found.held.sse_um2
             self._with_agreement(found)
             steps.append(AcceptedCause(wider.name, p_value(self.first_looks, gain, self.seed), gain / held.sse_um2))
             current, held = found.fit, found.held
@@ -555,9 +557,9 @@ class Search:
                 out.append(one)
         return out
 
-    def _with_witness(self, candidate: CauseCandidate) -> float:
-        """The cost, halved where the signature of the cause is seen: flexible forms imitate many causes."""
-        return candidate.cost * (0.5 if self.seen(candidate.cause) else 1.0)
+    def _with_witness(self, candidate: CauseCandidate) -> tuple[bool, float]:
+        """The cost, behind that of causes whose signature is seen: flexible forms imitate many causes."""
+        return not self.seen(candidate.cause), candidate.cost
 
     def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the other hold between samples, if that fits better: a large cause can hide it."""
@@ -652,16 +654,22 @@ class Search:
         return fit, held
 
     def may_be_zero(self, fit: ModelFit, index: int, small: bool) -> bool:
-        """Whether the intervals of all its numbers hold zero, of a cause that removes little or that is never zero."""
-        if not small and not fit.model.causes[index].never_zero:
+        """Whether the intervals of all its numbers hold zero, of a cause that removes little or that is never zero.
+
+        Of several numbers of one form each may stand for the others; a single one that may be zero says nothing.
+        """
+        cause = fit.model.causes[index]
+        reported = cause.reported(fit.model.parameters_of(fit.p, index), fit.model.data).values()
+        several = np.linalg.matrix_rank(np.array([gradient for _, gradient in reported])) > 1
+        if not small and several and not cause.never_zero:
             return False
         return across_zero(parameter_errors(fit, self.mask, self.parts, self.readings), index)
 
-    def beyond_bound(self, fit: ModelFit, index: int) -> bool:
-        """Whether the interval of the first number of ``causes[index]`` lies beyond the bound that it widens."""
-        cause = fit.model.causes[index]
-        (low, _), *_ = numbers(parameter_errors(fit, self.mask, self.parts, self.readings), index)[1].values()
-        return low > cause.parameters(fit.model.data)[0].neutral
+    def beyond_bound(self, fit: ModelFit, index: int, gain_um2: float, held: HeldOut) -> bool:
+        """Whether ``causes[index]``, which widens a bound, lies beyond it and is worth it beside all others."""
+        assert self.readings is not None
+        words = fit.model.causes[index].agreement(fit.model.parameters_of(fit.p, index), self.readings)
+        return bool(words) and self.share(gain_um2, held) > self.thresholds.least_share
 
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""
@@ -675,10 +683,16 @@ class Search:
         where = fit.model.slice_of(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
         less = calibrate(fit.model.without_cause(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
-        if self.nominal is not None and (fit.model.causes[index].takes_over or less.sse_um2 > self.nominal.sse_um2):
-            # It changed the nominal stage too much: start from that calibrated alone.
-            start[: fit.model.n_nominal] = self.nominal.p
-            less = calibrate(less.model, start, self.mask, 12, 1e-4)
+        if self.nominal is not None:
+            # The nominal stage, and what acts on its loop, may stand where they do only beside it.
+            alone = np.array(
+                [
+                    s.neutral if s.acts_on == ActsOn.STATIC else v
+                    for s, v in zip(less.model.parameters, start, strict=True)
+                ]
+            )
+            alone[: fit.model.n_nominal] = self.nominal.p
+            less = min(less, calibrate(less.model, alone, self.mask, 12, 1e-4), key=lambda f: f.sse_um2)
         if fit.model.causes[index].fast:
             # It may have stood for the stage's own lag, or for half a sample of the hold.
             less = min(less, with_dynamics_anew(less, self.mask), key=lambda f: f.sse_um2)
@@ -719,7 +733,7 @@ def review(
         less = search.without(fit, index)
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
-        if cause.widens and search.beyond_bound(fit, index):
+        if cause.widens and search.beyond_bound(fit, index, gain, held_less):
             # A bound was widened for it, and nothing competes with it: its own number decides.
             found.append(ReviewedCause(steps[cause.name], less.without_signals(), held_less))
             index += 1

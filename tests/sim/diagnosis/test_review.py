@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.types import FloatArray
+from dehyst.sim.diagnosis.search import search as search_module
 from dehyst.sim.diagnosis.search.held_out import HeldOut, Split
 from dehyst.sim.diagnosis.search.screening import ScreenedCause
 from dehyst.sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
@@ -144,6 +145,37 @@ def test_the_search_goes_on_without_a_cause_whose_numbers_may_be_zero() -> None:
     _, _, found = review(search, fit, search.held(fit), {})
     assert not found
     assert search.skipped == [{"rate_dependence"}]
+
+
+@dataclass(frozen=True)
+class Numbers(CauseModel):
+    """Two reported numbers, of one parameter or of two."""
+
+    parameters_told: int = 1
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        gradients = np.eye(2) if self.parameters_told == 2 else np.array([[1.0, 0.0], [3.0, 0.0]])
+        return {"one": (0.1, gradients[0]), "other": (0.2, gradients[1])}
+
+
+@pytest.mark.parametrize(("told", "small", "dropped"), [(1, False, True), (2, False, False), (2, True, True)])
+def test_a_number_that_may_be_zero_counts_alone_and_one_of_several_only_in_a_small_cause(
+    monkeypatch: pytest.MonkeyPatch, told: int, small: bool, dropped: bool
+) -> None:
+    monkeypatch.setattr(search_module, "parameter_errors", lambda *_: None)
+    monkeypatch.setattr(search_module, "across_zero", lambda *_: True)
+    search, _ = reviewed({"delay": np.ones(12)})
+    fit = search.fit_of((Numbers(name="delay", parameters_told=told),))
+    assert Search.may_be_zero(search, fit, 0, small) is dropped
+
+
+def test_what_the_readings_show_is_tried_first() -> None:
+    search, _ = reviewed({"creep": np.ones(12)}, sights={"creep": Sight(True, ""), "delay": Sight(None, "")})
+    causes = [replace(CauseModel(), name=name) for name in ("delay", "hysteresis_shape", "creep")]
+    fit = search.fit_of(())
+    tried = [CauseCandidate(c, fit, search.held(fit), cost) for c, cost in zip(causes, (2.0, 1.0, 9.0), strict=True)]
+    order = [c.cause.name for c in sorted(tried, key=search._with_witness)]
+    assert order == ["creep", "hysteresis_shape", "delay"]
 
 
 def test_the_other_one_of_a_set_is_no_rival_of_a_third_cause() -> None:

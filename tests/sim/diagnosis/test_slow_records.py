@@ -8,14 +8,17 @@ import pytest
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.diagnosis.diagnose import usable, without_start
 from dehyst.sim.diagnosis.witnesses import witnesses
+from dehyst.sim.effects.creep import Creep
 from dehyst.sim.effects.mains_hum import MainsHum
 from dehyst.sim.effects.rate_dependence import RateDependence
 from dehyst.sim.effects.resonance import find_ringing, ringing_peak
 from dehyst.sim.effects.saturation import find_limits
+from dehyst.sim.effects.thermal_drift import Wander, in_cycles
 from dehyst.sim.fitting.fit_data import FitData
 from dehyst.sim.readings.noise import reading_limits
 from dehyst.sim.readings.readings import Readings
 from dehyst.sim.readings.sight import Sight
+from dehyst.sim.readings.slow_motion import USUAL
 from tests.foreign.inject import inject
 
 DT, N = 0.005, 4000
@@ -67,6 +70,30 @@ def test_a_drift_of_any_form_is_seen_in_equal_cycles(cause: str) -> None:
     assert found["thermal_drift"].seen is True, found["thermal_drift"].words
     # One that settles may be creep: then both are one set.
     assert found["creep"].seen is not True or "creep" in found["thermal_drift"].also, found["creep"].words
+
+
+def test_the_course_of_a_walk_is_that_of_the_means_over_one_period() -> None:
+    data, _ = injected("thermal_walk")
+    walk = data.y_um - sine()[1]
+    form = Wander().shown(Readings(data, np.ones(N, dtype=np.bool_), SIGMA_UM))
+    assert not form.missing(data)
+    left = walk - form.motion(np.zeros(N), np.ones(1), data)
+    inside = slice(400, -400)
+    assert np.std(left[inside]) < 0.25 * np.std(walk[inside])
+
+
+def test_a_drift_below_the_usual_is_not_seen_in_cycles() -> None:
+    u, y = sine()
+    for share, seen in ((0.3, None), (3.0, True)):
+        drifted = y + share * USUAL * np.ptp(y) * np.linspace(0.0, 1.0, N)
+        found = in_cycles(Readings(FitData(DT, u, drifted), np.ones(N, dtype=np.bool_), 1e-4))
+        assert found.seen is seen, found.words
+
+
+def test_a_creep_of_fast_lags_alone_is_no_creep() -> None:
+    data, form = FitData(DT, *sine()), Creep()
+    assert form.plausible(np.array([5e-3, 2e-3, 0.0, 0.0]), data)
+    assert not form.plausible(np.array([5e-3, -8e-3, 0.0, 0.0]), data)
 
 
 def test_a_gain_that_drifts_about_the_middle_moves_no_mean() -> None:
