@@ -48,21 +48,22 @@ class Tracking:
 
 
 @dataclass(frozen=True, slots=True)
-class Diagnostics:
+class _Fields:
+    t_s: float
+    seq: int
+    fields: Mapping[str, Any]
+
+
+class Diagnostics(_Fields):
     """Diagnostics of the learner, about 20 times a second; every field may be missing (docs/viewer.md)."""
 
-    t_s: float
-    seq: int
-    fields: Mapping[str, Any]
 
-
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(_Fields):
     """The service's status, about once a second."""
 
-    t_s: float
-    seq: int
-    fields: Mapping[str, Any]
+
+class Health(_Fields):
+    """Counts of the stream itself since its start, by name: received, malformed, dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +75,6 @@ class Event:
     text: str
     level: str = "INFO"
     change: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Health:
-    """Counts of the stream itself since its start, by name: received, malformed, dropped."""
-
-    t_s: float
-    seq: int
-    counts: Mapping[str, int]
 
 
 Record = Tracking | Diagnostics | Status | Event | Health

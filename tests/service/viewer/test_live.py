@@ -131,7 +131,7 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
     assert event.t_s == pytest.approx(0.5), "told by its sequence number"
     assert ahead.t_s == pytest.approx((51 * BATCH + 100) * DT_S)
     assert far.t_s == pytest.approx((51 * BATCH - 1) * DT_S)
-    last = basket.of(Health)[-1].counts
+    last = basket.of(Health)[-1].fields
     assert (last["samples"], last["malformed"], last.get("inbox_full", 0)) == (2 * 51 * BATCH, 5, 0)
 
 
