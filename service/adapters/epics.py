@@ -19,7 +19,6 @@ import argparse
 import math
 import time
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, Final
 
 import zenoh
@@ -43,15 +42,12 @@ PVAccess knows no passwords: everybody who reaches the address may freeze the ax
 #: The model that ENABLE = 0 serves.
 PLAIN: Final = "linear"
 _OK, _MAJOR, _INVALID = 0, 2, 3
-#: Name, type of p4p, and unit of the variables.
-_READ: Final = (
-    ("STATUS", "s", ""),
-    ("TRUST", "d", ""),
-    ("MODEL_ERROR", "d", "%"),
-    ("SAMPLE", "l", ""),
-    ("SERVED", "s", ""),
-)
-_WRITTEN: Final = ("FREEZE", "ENABLE")
+#: Type of p4p and unit of the variables, and their initial values by type.
+_VARIABLES: Final = {
+    "STATUS": ("s", ""), "TRUST": ("d", ""), "MODEL_ERROR": ("d", "%"), "SAMPLE": ("l", ""), "SERVED": ("s", ""),
+    "FREEZE": ("?", ""), "ENABLE": ("?", ""),
+}  # fmt: skip
+_INITIAL: Final[dict[str, Any]] = {"s": "", "d": math.nan, "l": -1, "?": False}
 
 
 class EpicsAxis:
@@ -77,14 +73,14 @@ class EpicsAxis:
         self._variables: dict[str, Any] = {}
         #: The model that ENABLE = 1 serves.
         self._enabled_model = AUTO
-        for name, kind, unit in _READ:
-            self._variables[name] = _variable(threads, scalars, kind, unit)
-        for name, command in zip(_WRITTEN, (self._freeze, self._enable), strict=True):
-            self._variables[name] = _variable(threads, scalars, "?", "")
-            self._variables[name].put(_handler(command))
         provider = server.StaticProvider("dehyst")
-        for name, variable in self._variables.items():
+        for name, (kind, unit) in _VARIABLES.items():
+            initial = {"value": _INITIAL[kind]} | ({"display.units": unit} if unit else {})
+            variable = threads.SharedPV(nt=scalars.NTScalar(kind, display=kind in "dl"), initial=initial)
+            self._variables[name] = variable
             provider.add(f"{prefix}:{name}", variable)
+        for name, command in (("FREEZE", self._freeze), ("ENABLE", self._enable)):
+            self._variables[name].put(_handler(command))
         local = {
             "EPICS_PVAS_INTF_ADDR_LIST": interface, "EPICS_PVAS_SERVER_PORT": str(port),
             "EPICS_PVAS_BROADCAST_PORT": str(port + 1 if port else 0),
@@ -108,9 +104,9 @@ class EpicsAxis:
         try:
             status = self._status()
         except ServiceError as error:
-            for name in (*(name for name, *_ in _READ), *_WRITTEN):
-                self._post(name, None, _INVALID, str(error))
-            self._post("STATUS", "no_service", _INVALID, str(error))
+            for name, variable in self._variables.items():
+                shown = "no_service" if name == "STATUS" else variable.current().raw.value
+                self._post(name, shown, _INVALID, str(error))
             return "no_service"
         shown = str(status["trouble"] or ("frozen" if status["frozen"] else "stale" if status["stale"] else "ok"))
         severity = _OK if shown in ("ok", "frozen") else _MAJOR
@@ -138,11 +134,7 @@ class EpicsAxis:
         raise ServiceError(f"{self._keys.base}: no reply within {self._timeout_s:g} s; is the service running?")
 
     def _post(self, name: str, value: Any, severity: int, message: str) -> None:
-        variable = self._variables[name]
-        if value is None:
-            value = variable.current().raw.value
-        stamp_unix_s = time.time()
-        variable.post(value, timestamp=stamp_unix_s, severity=severity, message=message[:80])
+        self._variables[name].post(value, timestamp=time.time(), severity=severity, message=message[:80])
 
     def _freeze(self, on: bool) -> None:
         operate(self._session, self._keys, "freeze" if on else "thaw", "epics", None, self._timeout_s, self._by)
@@ -152,13 +144,6 @@ class EpicsAxis:
         model = self._enabled_model if on else PLAIN
         operate(self._session, self._keys, "select", "epics", {"model": model}, self._timeout_s, self._by)
         self.poll()
-
-
-def _variable(threads: ModuleType, scalars: ModuleType, kind: str, unit: str) -> Any:
-    scalar = scalars.NTScalar(kind, display=kind in "dl")
-    initial: Any = {"s": "", "d": math.nan, "l": -1, "?": False}[kind]
-    variable = threads.SharedPV(nt=scalar, initial={"value": initial, **({"display.units": unit} if unit else {})})
-    return variable
 
 
 def _handler(command: Callable[[bool], None]) -> Callable[[Any, Any], None]:
@@ -181,16 +166,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "stage", "axis")
     add_connection(parser, wait_s=10.0, timeout_s=2.0)
     add("--interface", default="127.0.0.1", metavar="ADDRESS", help="address where PVAccess listens (%(default)s)")
-    add(
-        "--port",
-        type=int,
-        default=5075,
-        metavar="N",
-        help="its TCP port; names are searched at the next one (%(default)s)",
-    )
-    add(
-        "--every", type=float, default=1.0, metavar="S", help="time between two readings of the status, s (%(default)s)"
-    )
+    add("--port", type=int, default=5075, metavar="N", help="its TCP port; names are searched at the next one (5075)")
+    add("--every", type=float, default=1.0, metavar="S", help="time between two readings of the status, s (1.0)")
     add_shared(parser, "insecure-beyond-loopback", "duration")
 
 

@@ -107,27 +107,6 @@ class NodeConfig:
             raise FieldError("ticks", self.ticks, "at least 1")
 
 
-class FaultyRing(SampleRing):
-    """A ring whose messages an injector may change.
-
-    Samples that it leaves out count neither as published nor as lost; samples that it sends twice count twice.
-    """
-
-    def __init__(self, put: Callable[..., None], injector: Injector) -> None:
-        super().__init__(put)
-        self._injector = injector
-
-    def deliver(self, *rows: Any) -> None:
-        """Send what the faults make of one message."""
-        for message in self._injector.deliver(rows):
-            super().deliver(*message)
-
-    def finish(self) -> None:
-        """Send what a fault holds back."""
-        for message in self._injector.flush():
-            super().deliver(*message)
-
-
 class AxisPort:
     """One axis in the network: its commands, samples, publishers and faults."""
 
@@ -155,10 +134,10 @@ class AxisPort:
         self.status = session.declare_publisher(status_key(config.name, axis))
         self.gate = CommandGate(session, keys, by, self.commands.receive)
         self._declared: list[Any] = [self.gate, publisher, self.status]
-        self.ring = SampleRing(put) if self.injector is None else FaultyRing(put, self.injector)
-        self.rings = [self.ring]
+        self.rings = [SampleRing(put)]
         if self.injector is not None:
             receive = self.injector.receive
+            self.rings = [SampleRing(put, self.injector.deliver, self.injector.flush)]
             sound = session.declare_publisher(sound_key(config.name, axis), express=True)
             self.rings.append(SampleRing(lambda *rows: sound.put(wire.encode_samples(*rows))))
             faults = session.declare_subscriber(fault_key(config.name, axis), lambda s: receive(s.payload.to_bytes()))
@@ -172,15 +151,15 @@ class AxisPort:
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""
-        t_s = k * self._dt_s
-        self.ring.write(k, t_s, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
-        for sound in self.rings[1:]:
-            sound.write(k, t_s, u_V, y_um)
+        ring, *sound = self.rings
+        ring.write(k, k * self._dt_s, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+        for other in sound:
+            other.write(k, k * self._dt_s, u_V, y_um)
 
     def summary(self) -> dict[str, Any]:
         summary: dict[str, Any] = {
-            "published": self.ring.published,
-            "lost": self.ring.lost,
+            "published": self.rings[0].published,
+            "lost": self.rings[0].lost,
             "slew_limited": self.limited,
             "commands": dict(self.commands.counts),
             "command": self.gate.to_json(),
@@ -247,13 +226,10 @@ class StageNode:
 
     def summary(self) -> dict[str, Any]:
         """Ticks, late ticks, and per unit the counts of samples and commands so far."""
-        units = {port.axis: port.summary() for port in self._ports}
-        return {
-            "stage": self.config.name,
-            "dt_s": self.config.stage.dt_s,
-            **self._counts,
-            "units": units,
-        }
+        return {**self._common(), "units": {port.axis: port.summary() for port in self._ports}}
+
+    def _common(self) -> dict[str, Any]:
+        return {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
 
     def run(self, started: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Wait for the first commands of every unit (not in free run), then tick until the end or a stop.
@@ -307,6 +283,10 @@ class StageNode:
         k, late = first, 0
         worst_s = waited_s = 0.0
         now, wake = time.perf_counter, self._sender.wake
+
+        def count() -> None:
+            self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+
         start = now()
         while k < stop and not self._stop:
             due = start + waited_s + (k - first) * dt_s
@@ -314,8 +294,7 @@ class StageNode:
             if rest > 0.0:
                 time.sleep(rest)
             behind = now() - due
-            if behind > dt_s:
-                late += 1
+            late += behind > dt_s
             worst_s = max(worst_s, behind)
             if self.config.lock_step_s:
                 waited_s += self._wait_for_voltages(k)
@@ -323,11 +302,11 @@ class StageNode:
                 unit.step(k)
             k += 1
             if k % status_ticks == 0:
-                self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+                count()
                 wake(status=True)
             elif k % batch == 0:
                 wake()
-        self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+        count()
         self._counts["ran_s"] = now() - start
 
     def _wait_for_voltages(self, k: int) -> float:
@@ -339,8 +318,7 @@ class StageNode:
         return time.perf_counter() - begin
 
     def _publish_status(self) -> None:
-        common = {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
         for port in self._ports:
             # A lost status is followed by another.
             with contextlib.suppress(zenoh.ZError):
-                port.status.put(json.dumps({**common, "axis": port.axis, **port.summary()}))
+                port.status.put(json.dumps({**self._common(), "axis": port.axis, **port.summary()}))

@@ -183,15 +183,8 @@ class CheckpointFolder:
         for path in reversed(self._paths()):
             with contextlib.suppress(OSError, ModelFileError):
                 meta = _read_meta(path)
-                found.append(
-                    {
-                        "checkpoint": number_of(path),
-                        "seq": meta.seq,
-                        "samples": meta.samples,
-                        "time_unix_s": meta.time_unix_s,
-                        "bytes": path.stat().st_size,
-                    }
-                )
+                told = {name: getattr(meta, name) for name in ("seq", "samples", "time_unix_s")}
+                found.append({"checkpoint": number_of(path), **told, "bytes": path.stat().st_size})
         return found
 
     def read(self, number: int) -> tuple[CheckpointMeta, StateDict]:
@@ -256,11 +249,8 @@ def number_of(path: Path) -> int:
 
 def _read_meta(path: Path) -> CheckpointMeta:
     with open(path, "rb") as file:
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size or head[: len(MAGIC)] != MAGIC:
-            raise ModelFileError("not a checkpoint")
-        length = _HEAD.unpack(head)[1]
-        if length > MAX_HEADER_BYTES:
+        magic, length, _ = _HEAD.unpack(file.read(_HEAD.size).ljust(_HEAD.size))
+        if magic != MAGIC or length > MAX_HEADER_BYTES:
             raise ModelFileError("not a checkpoint")
         try:
             return CheckpointMeta.of(decode_header(file.read(length)))
@@ -305,10 +295,10 @@ class CheckpointKeeper:
         self._closing = False
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
-        self._owner: FolderOwner | None = None
-        if folder is not None:
-            self._owner = FolderOwner(folder.directory, LOCK, f"{stage}/{axis.config.name}")
-        self._bytes = self._bytes_in_all = 0
+        self._owner = None if folder is None else FolderOwner(folder.directory, LOCK, f"{stage}/{axis.config.name}")
+        self._bytes = 0
+        #: Bytes of all checkpoints that were written.
+        self.bytes_in_all = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
@@ -325,9 +315,9 @@ class CheckpointKeeper:
     def on_snapshot(self) -> None:
         """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
         now_s = self._clock()
-        if self.folder is not None and now_s >= self._due_at_s:
+        if now_s >= self._due_at_s:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
-            self._copy()
+            self.copy_now()
 
     def keep_listed(self) -> frozenset[int]:
         """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S` / 2."""
@@ -339,8 +329,14 @@ class CheckpointKeeper:
 
     def copy_now(self) -> None:
         """Copy the present state, to be written. Call it in the thread that handles samples."""
-        if self.folder is not None:
-            self._copy()
+        if self.folder is None:
+            return
+        copied = (self._meta(), self._axis.state_dict())
+        with self._ready:
+            # Replaces a copy that has not been written yet.
+            self._copied = copied
+            self._copies += 1
+            self._ready.notify_all()
 
     def wait_written(self, timeout_s: float) -> bool:
         """Wait until the last copy, or a later one, is on the disk; False if it is not, or no checkpoints are kept."""
@@ -364,20 +360,14 @@ class CheckpointKeeper:
             return None
         at = self._written_at_s
         a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
-        age_s = None if at is None else time.monotonic() - at
-        refused = self.folder.refused
-        return {**self._counts, "refused": refused, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
-
-    @property
-    def bytes_in_all(self) -> int:
-        """Bytes of all checkpoints that were written."""
-        return self._bytes_in_all
+        ages = {"refused": self.folder.refused, "age_s": None if at is None else time.monotonic() - at}
+        return {**self._counts, **ages, "bytes": self._bytes, "bytes_per_day": a_day}
 
     def close(self) -> None:
         """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
         if self.folder is None:
             return
-        self._copy()
+        self.copy_now()
         with self._ready:
             self._closing = True
             self._ready.notify_all()
@@ -386,47 +376,34 @@ class CheckpointKeeper:
             self._owner.release()
 
     def _meta(self) -> CheckpointMeta:
-        stage, name, instance = self._names
-        axis = self._axis
+        (stage, name, instance), axis = self._names, self._axis
         seq, samples, unix_s = axis.handled_seq, axis.sequence.received, time.time()
         return CheckpointMeta(stage, name, axis.dt_s, seq, samples, unix_s, instance, models=axis.identified)
-
-    def _copy(self) -> None:
-        meta = self._meta()
-        copied = (meta, self._axis.state_dict())
-        with self._ready:
-            # Replaces a copy that has not been written yet.
-            self._copied = copied
-            self._copies += 1
-            self._ready.notify_all()
 
     def _run(self) -> None:
         assert self.folder is not None
         assert self._owner is not None
         while True:
             with self._ready:
-                while self._copied is None and not self._closing:
-                    self._ready.wait()
+                self._ready.wait_for(lambda: self._copied is not None or self._closing)
                 if self._copied is None:
                     return
                 (meta, state), self._copied = self._copied, None
                 copy = self._copies
-            written = False
+            on_disk = self._on_disk
             try:
                 self._owner.take()
                 self._bytes = self.folder.write(meta, state).stat().st_size
-                self._bytes_in_all += self._bytes
+                self.bytes_in_all += self._bytes
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
-                self._written_at_s = time.monotonic()
-                written = True
+                self._written_at_s, on_disk = time.monotonic(), copy
             except (OSError, DehystError, ValueError) as error:
                 words = (isinstance(error, OSError) and error.strerror) or str(error)
                 if not self._counts["degraded"]:
                     self._axis.note("checkpoint_failed", f"{words}; tried again")
                 self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
             with self._ready:
-                self._tried = copy
-                self._on_disk = copy if written else self._on_disk
+                self._tried, self._on_disk = copy, on_disk
                 self._ready.notify_all()
 
 
@@ -470,20 +447,20 @@ def learn_again(axis: Axis, recordings: Path | None, switch: Switch | None = Non
     recorded a second time.
     """
     begun = axis.sequence.received
-    rows = None if recordings is None else rows_behind(recordings, begun, axis.owner)
-    count = 0 if rows is None else len(rows)
+    samples = None if recordings is None else rows_behind(recordings, begun, axis.owner)
+    count = 0 if samples is None else len(samples)
     first = max(0, count - _MOST_AGAIN)
     at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)
     start = first
-    while rows is not None and start < count:
+    while samples is not None and start < count:
         if start == at and switch is not None:
             axis.set_frozen(switch.freezes, switch.who)
         stop = min(start + _PORTION, count, at if start < at else count)
-        part = rows.part(start, stop)
-        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
+        part = slice(start, stop)
+        axis.handle(SampleBatch(samples.seq[part], samples.t_s[part], samples.u_V[part], samples.y_um[part]))
         start = stop
     if switch is not None and at >= count:
         axis.set_frozen(switch.freezes, switch.who)
-    if rows is not None:
+    if samples is not None:
         axis.note("learnt_again", f"{count - first} samples from the journal")
     return count - first

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dehyst.service.background.job import BackgroundJob
 from dehyst.service.protocol.errors import FieldError
@@ -38,6 +38,7 @@ from dehyst.service.storage.segments import (
     make_room,
     next_number,
     number_of,
+    rows_of,
 )
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
@@ -117,14 +118,13 @@ class Recorder:
         if hold_s is not None:
             self._folder.hold("recorder", hold_s)
         self.index = index
-        self._queue: deque[tuple[int, Rows]] = deque()
+        self._queue: deque[Rows] = deque()
         self._waiting = 0
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._stop = False
-        self._counts = {"offered": 0, "written": 0, "dropped": 0, "lost": 0, "errors": 0, "segments": 0, "removed": 0}
-        self._counts["bytes"] = 0
-        self._salvaged = 0
+        names = ("offered", "written", "dropped", "lost", "errors", "segments", "removed", "bytes", "salvaged")
+        self._counts = dict.fromkeys(names, 0)
         self._error = ""
         self._segment: Journal | None = None
         # Whether there may be journals to close, and the number of the first one that is of this recorder.
@@ -149,16 +149,15 @@ class Recorder:
         Returns False if they were dropped, because the queue is full or the recorder is closed. Raises InputError on
         unequal lengths.
         """
-        numbers = np.array(seq, dtype=np.int64).reshape(-1)
-        t, u, y = (np.array(c, dtype=np.float64).reshape(-1) for c in (t_s, u_V, y_um))
-        rows = Rows(numbers, t, u, y, [reason] * len(numbers) if isinstance(reason, str) else list(reason))
+        rows = rows_of(seq, t_s, u_V, y_um, reason)
         with self._lock:
             self._counts["offered"] += len(rows)
-            first, self.index = self.index, self.index + len(rows)
+            rows["index"] = self.index + np.arange(len(rows))
+            self.index += len(rows)
             if self._stop or self._waiting + len(rows) > self.config.queue_samples:
                 self._counts["dropped"] += len(rows)
                 return False
-            self._queue.append((first, rows))
+            self._queue.append(rows)
             self._waiting += len(rows)
         # Wake the thread before its pause is over: a crash loses samples that are only in memory.
         self._wake.set()
@@ -185,14 +184,11 @@ class Recorder:
         ``degraded`` is True from a failure of the disk until the next batch is written.
         """
         with self._lock:
+            aside = 0 if self._aside is None else self._aside.counters()["written"]
             return {
-                **self._counts,
-                "salvaged": self._salvaged,
-                "waiting": self._waiting,
-                "aside": 0 if self._aside is None else self._aside.counters()["written"],
-                "degraded": bool(self._error),
-                "error": self._error,
-            }
+                **self._counts, "waiting": self._waiting, "aside": aside,
+                "degraded": bool(self._error), "error": self._error,
+            }  # fmt: skip
 
     def close(self, timeout_s: float = 10.0) -> bool:
         """Write the queue, close the segment, end the thread. Returns False if that takes longer than ``timeout_s``."""
@@ -215,38 +211,37 @@ class Recorder:
             self._wake.clear()
             stop = self._stop
             taken = self._take()
-            if taken is not None:
-                self._write(*taken)
+            if taken:
+                self._write(np.concatenate(taken))
             elif stop:
                 break
             self._look_after_closing()
             if not stop:
                 self._wake.wait(self.config.flush_s)
-        if self._segment is not None:
-            self._segment.close()
+        self._leave_segment()
         self._close_all()
         self._folder.release()
 
-    def _take(self) -> tuple[Rows, NDArray[np.int64]] | None:
+    def _take(self) -> list[Rows]:
         with self._lock:
-            parts = list(self._queue)
+            taken = list(self._queue)
             self._queue.clear()
             self._waiting = 0
-        if not parts:
-            return None
-        index = np.concatenate([first + np.arange(len(rows)) for first, rows in parts])
-        return Rows.joined([rows for _, rows in parts]), index
+        return taken
 
     def _count(self, **more: int) -> None:
         with self._lock:
             for name, value in more.items():
                 self._counts[name] += value
 
-    def _failed(self, error: OSError) -> None:
-        self._not_before = time.monotonic() + self.config.retry_s
+    def _failed(self, why: str) -> None:
         with self._lock:
             self._counts["errors"] += 1
-            self._error = f"{error.strerror or error}"
+            self._error = why
+
+    def _pause(self, error: OSError) -> None:
+        self._not_before = time.monotonic() + self.config.retry_s
+        self._failed(error.strerror or str(error))
 
     def _begin_segment(self) -> Journal:
         directory = self.config.directory
@@ -256,7 +251,7 @@ class Recorder:
         self._first = min(self._first, number)
         return Journal(journal_of(directory, number))
 
-    def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
+    def _write(self, rows: Rows) -> None:
         # After a failure: pause, except at the end, where one more attempt costs nothing.
         if time.monotonic() < self._not_before and not self._stop:
             self._count(lost=len(rows))
@@ -268,24 +263,26 @@ class Recorder:
                 if self._segment is None:
                     self._segment = self._begin_segment()
                 stop = min(len(rows), done + self.config.rows - self._segment.rows)
-                written = self._segment.write(rows.part(done, stop), index[done:stop])
+                written = self._segment.write(rows[done:stop])
                 self._count(written=stop - done, bytes=written)
                 done = stop
                 if self._segment.rows >= self.config.rows:
-                    self._segment.close()
-                    self._segment, self._left_open = None, True
+                    self._leave_segment()
             if self._segment is not None:
                 self._syncer.look(self._segment)
             if time.monotonic() >= max(self._not_before, self._told_until):
                 with self._lock:
                     self._error = ""
         except OSError as error:
-            self._failed(error)
+            self._pause(error)
             self._count(lost=len(rows) - done)
-            if self._segment is not None:
-                # The rows in this journal are converted to Parquet later.
-                self._segment.close()
-                self._segment, self._left_open = None, True
+            self._leave_segment()
+
+    def _leave_segment(self) -> None:
+        """Close the open journal; its rows are converted to Parquet later."""
+        if self._segment is not None:
+            self._segment.close()
+            self._segment, self._left_open = None, True
 
     def _look_for_folder(self) -> None:
         """Begin anew where the folder was removed or renamed; the recording is degraded for a while, but goes on."""
@@ -293,14 +290,10 @@ class Recorder:
         if self._segment is None or now < self._look_at:
             return
         self._look_at = now + _LOOK_S
-        if not self._segment.vanished:
-            return
-        self._segment.close()
-        self._segment = None
-        self._told_until = now + self.config.retry_s
-        with self._lock:
-            self._counts["errors"] += 1
-            self._error = f"{self.config.directory} vanished while it was recorded into; it is made anew"
+        if self._segment.vanished:
+            self._leave_segment()
+            self._told_until = now + self.config.retry_s
+            self._failed(f"{self.config.directory} vanished while it was recorded into; it is made anew")
 
     def _look_after_closing(self) -> None:
         """Convert the journals that are full, or that a crash or a failing disk left."""
@@ -317,12 +310,12 @@ class Recorder:
         try:
             made = closed()
             own = sum(number_of(path) >= self._first for path in made)
-            self._count(bytes=sum(path.stat().st_size for path in made), segments=own)
-            self._salvaged += len(made) - own
-            self._count(removed=make_room(self.config.directory, self.config.max_bytes))
+            written = sum(path.stat().st_size for path in made)
+            removed = make_room(self.config.directory, self.config.max_bytes)
+            self._count(bytes=written, segments=own, salvaged=len(made) - own, removed=removed)
         except OSError as error:
             self._left_open = True
-            self._failed(error)
+            self._pause(error)
 
     def _close_all(self) -> None:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""

@@ -17,12 +17,12 @@ Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diag
 extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
 
-  dehyst diagnose recording.parquet --out out/diagnosis
+  dehyst diagnose recording.csv --out out/diagnosis
   dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
   dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 1e-3 --out out/diagnosis
   dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
       --out out/diagnosis
-  dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
+  dehyst diagnose train.csv --nominal linear --range 0:10 --out out/diagnosis --json
 """
 
 

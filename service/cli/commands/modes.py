@@ -20,7 +20,6 @@ Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/
   dehyst modes low.npz high.npz --column u=u --unit u=V --column rate=fs_hz --out out/modes
   dehyst modes a.csv b.csv c.csv --column u=CH1,CH2,CH3 --unit u=V --column y=X,Y --unit y=nm --period 8192 \\
       --skip-periods 1 --out out/modes
-  dehyst modes train.npz --test test.npz --period 4096 --out out/modes --json
 """
 
 
@@ -33,22 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         out={"required": True, "help": "folder for the report"},
         test={"nargs": "+", "default": [], "help": "recordings to judge by, of the same amplitudes; not fitted"},
     )
-    parser.add_argument("--period", type=int, metavar="N", help="length of a period, samples")
-    parser.add_argument(
-        "--skip-periods", type=int, default=0, metavar="K", help="periods at the start that are not steady (0)"
-    )
-    parser.add_argument(
-        "--hold-out",
-        type=int,
-        metavar="R",
-        help="realisations to hold out at amplitudes without a test recording (a third, where enough remain)",
-    )
-    parser.add_argument(
-        "--start-modes", type=int, default=30, metavar="N", help="pole pairs to start from; useless ones go (30)"
-    )
-    parser.add_argument(
-        "--degree", type=int, metavar="D", help="of the polynomials in the amplitude (2, or what the amplitudes allow)"
-    )
+    add = parser.add_argument
+    add("--period", type=int, metavar="N", help="length of a period, samples")
+    add("--skip-periods", type=int, default=0, metavar="K", help="periods at the start that are not steady (0)")
+    add("--hold-out", type=int, metavar="R", help="realisations to hold out at amplitudes without a test recording "
+        "(a third, where enough remain)")  # fmt: skip
+    add("--start-modes", type=int, default=30, metavar="N", help="pole pairs to start from; useless ones go (30)")
+    add("--degree", type=int, metavar="D", help="of the polynomials in the amplitude (2, or what the amplitudes allow)")
     add_shared(parser, "no-pictures", "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser)
 

@@ -159,11 +159,11 @@ def run(args: argparse.Namespace) -> int:
 
 def write_example_files(folder: Path) -> int:
     """Write them and print what is what. Returns 0. Raises InputError where the folder cannot be written to."""
-    from dehyst.service.stage_node.example_files import write_examples
+    from dehyst.service.stage_node.example_files import FILES, write_examples
 
     try:
-        for name, text in write_examples(folder):
-            print(f"{name:<34}{text}")
+        write_examples(folder)
     except OSError as error:
         raise FieldError("--examples", f"{folder}: {error}", "a folder that can be written to") from error
+    print(*(f"{name:<16}{text}" for name, text in FILES.items()), sep="\n")
     return 0

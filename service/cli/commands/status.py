@@ -59,10 +59,10 @@ def run(args: argparse.Namespace) -> int:
     with opened as session:
         standbys = Standbys(session, args.stage, args.axis)
         try:
-            if not args.once and not args.check:
-                return _live(session, standbys, args)
             if args.check:
                 return _check(_settled(session, args))
+            if not args.once:
+                return _live(session, standbys, args)
             all_answered = time.monotonic() + _STANDBY_PERIOD_S
             found = _settled(session, args)
             time.sleep(max(0.0, all_answered - time.monotonic()))
@@ -80,17 +80,13 @@ def _check(found: list[dict[str, Any]]) -> int:
         return 4
     worst = 0
     for status in found:
-        name = f"{status['stage']}/{status['axis']}"
         state, reason = str(status.get("state", "unknown")), str(status.get("state_reason", ""))
-        if state == "ok":
-            print(f"{name}: ok")
-            print("".join(f"{line}\n" for line in warnings(status)), end="")
-            continue
-        # It still answers, safely: a human should look. A wrong sensor or model is more urgent.
-        urgent = bool(status.get("trouble")) or state in ("stale", "dropping")
-        worst = max(worst, 3 if urgent else 1)
-        print(f"{name}: {state}: {reason}")
-        print("".join(f"{line}\n" for line in warnings(status)), end="")
+        if state != "ok":
+            # It still answers, safely: a human should look. A wrong sensor or model is more urgent.
+            urgent = bool(status.get("trouble")) or state in ("stale", "dropping")
+            worst = max(worst, 3 if urgent else 1)
+        said = state if state == "ok" else f"{state}: {reason}"
+        print(f"{status['stage']}/{status['axis']}: {said}", *warnings(status), sep="\n")
     return worst
 
 
