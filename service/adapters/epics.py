@@ -190,9 +190,6 @@ def run(args: argparse.Namespace) -> int:
     ):
         shown = axis.poll()
         print(f"ready: {args.prefix}:STATUS {shown} at {args.interface}, port {args.port}", flush=True)
-        until = math.inf if args.duration is None else time.monotonic() + args.duration
-        while not stop.reason and time.monotonic() < until:
-            stop.wait(min(args.every, max(0.0, until - time.monotonic())))
-            if not stop.reason:
-                axis.poll()
+        for _ in stop.every(args.every, args.duration):
+            axis.poll()
     return 0

@@ -145,6 +145,14 @@ def build_settings(kind: type[T], table: Mapping[str, Any], where: str, folder: 
         raise _placed(error, where) from error
 
 
+def check_bounds(settings: Any) -> None:
+    """Raise FieldError where a number of a dataclass of settings is outside its bounds: for its ``__post_init__``."""
+    for key in keys_of(type(settings)):
+        value = getattr(settings, key.field)
+        if isinstance(value, int | float) and not key.setting.holds(value):
+            raise FieldError(key.name, value, key.setting.range())
+
+
 def field_name(where: str, key: str) -> str:
     """``key`` with what stands before it in a message."""
     return f"{where} {key}" if where.endswith(":") else f"{where}.{key}"

@@ -20,11 +20,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import zenoh
 
 from dehyst.service.answers.guard import limit_voltage
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import Keys
@@ -39,9 +40,6 @@ from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.stage import Stage
 
 # --- The node.
-
-#: Longest wait of the clock for a voltage, s.
-MAX_LOCK_STEP_S = 60.0
 
 # --- One axis on the wire
 
@@ -76,14 +74,14 @@ class NodeConfig:
     stage: StageConfig
     name: str
     units: tuple[str, ...]
-    batch: int = 1
-    ticks: int | None = None
+    batch: Annotated[int, Setting(low=1, high=10_000)] = 1
+    ticks: Annotated[int | None, Setting(low=1)] = None
     free_run: bool = False
     second: str = ""
     inject: bool = False
     first: int = 0
     slew_V_per_s: float = math.inf
-    lock_step_s: float = 0.0
+    lock_step_s: Annotated[float, Setting(unit="s", low=0.0, high=60.0)] = 0.0
 
     def __post_init__(self) -> None:
         if not self.units or len(set(self.units)) < len(self.units):
@@ -96,15 +94,10 @@ class NodeConfig:
                 raise FieldError("second", self.second, "another name than those of the units")
             if self.stage.second_axis is None:
                 raise FieldError("second", self.second, f"nothing: stage {self.stage.name!r} has one axis")
-        if not 1 <= self.batch <= 10_000:
-            raise FieldError("batch", self.batch, "1 to 10000 samples a message")
+        check_bounds(self)
         check_seq("first", self.first)
         if not self.slew_V_per_s > 0.0:
             raise FieldError("slew_V_per_s", self.slew_V_per_s, "a positive limit in V/s")
-        if not 0.0 <= self.lock_step_s <= MAX_LOCK_STEP_S:
-            raise FieldError("lock_step_s", self.lock_step_s, f"0 to {MAX_LOCK_STEP_S:g} s")
-        if self.ticks is not None and self.ticks < 1:
-            raise FieldError("ticks", self.ticks, "at least 1")
 
 
 class AxisPort:

@@ -16,30 +16,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dehyst.service.background.job import BackgroundJob
-from dehyst.service.protocol.errors import FieldError
+from dehyst.service.config.schema import Setting, check_bounds
+from dehyst.service.storage import segments
 from dehyst.service.storage.owner import FolderOwner
-from dehyst.service.storage.segments import (
-    LOCK,
-    RECORD,
-    Journal,
-    Rows,
-    Syncer,
-    close_left_open,
-    closed_by,
-    closing,
-    journal_of,
-    left_open,
-    make_room,
-    next_number,
-    number_of,
-    rows_of,
-)
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"
@@ -47,6 +32,7 @@ ASIDE: Final = "_aside"
 _LOOK_S: Final = 0.2
 #: Fewest samples per segment: each costs a process that closes it.
 _LEAST_ROWS: Final = 1000
+_SOME, _TIME = Setting(low=1), Setting(unit="s", low=0, above=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,31 +55,25 @@ class RecorderConfig:
 
     directory: Path
     owner: str = ""
-    segment_rows: int = 600_000
-    max_bytes: int = 2_000_000_000
-    queue_samples: int = 100_000
-    flush_s: float = 0.03
-    sync_s: float = 5.0
-    retry_s: float = 5.0
+    segment_rows: Annotated[int, _SOME] = 600_000
+    max_bytes: Annotated[int, _SOME] = 2_000_000_000
+    queue_samples: Annotated[int, _SOME] = 100_000
+    flush_s: Annotated[float, _TIME] = 0.03
+    sync_s: Annotated[float, _TIME] = 5.0
+    retry_s: Annotated[float, _TIME] = 5.0
 
     def __post_init__(self) -> None:
-        for name, least in (("segment_rows", 1), ("max_bytes", 1), ("queue_samples", 1)):
-            value = getattr(self, name)
-            if value < least:
-                raise FieldError(name, value, f"a whole number of at least {least}")
-        for name in ("flush_s", "sync_s", "retry_s"):
-            if not getattr(self, name) > 0.0:
-                raise FieldError(name, getattr(self, name), "a positive time in s")
+        check_bounds(self)
 
     @property
     def rows(self) -> int:
         """Samples per segment: two journals, and what is made of one, fit into ``max_bytes``."""
-        return min(self.segment_rows, max(_LEAST_ROWS, self.max_bytes // (4 * RECORD.itemsize)))
+        return min(self.segment_rows, max(_LEAST_ROWS, self.max_bytes // (4 * segments.RECORD.itemsize)))
 
     @property
     def journal_bytes(self) -> int:
         """Size of a full journal."""
-        return self.rows * RECORD.itemsize
+        return self.rows * segments.RECORD.itemsize
 
     def aside(self) -> RecorderConfig:
         """Settings for samples that the axis does not handle: a folder inside this one, a tenth of its disk space."""
@@ -114,11 +94,11 @@ class Recorder:
 
     def __init__(self, config: RecorderConfig, index: int = 0, hold_s: float | None = None) -> None:
         self.config = config
-        self._folder = FolderOwner(config.directory, LOCK, config.owner)
+        self._folder = FolderOwner(config.directory, segments.LOCK, config.owner)
         if hold_s is not None:
             self._folder.hold("recorder", hold_s)
         self.index = index
-        self._queue: deque[Rows] = deque()
+        self._queue: deque[segments.Rows] = deque()
         self._waiting = 0
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -126,14 +106,14 @@ class Recorder:
         names = ("offered", "written", "dropped", "lost", "errors", "segments", "removed", "bytes", "salvaged")
         self._counts = dict.fromkeys(names, 0)
         self._error = ""
-        self._segment: Journal | None = None
+        self._segment: segments.Journal | None = None
         # Whether there may be journals to close, and the number of the first one that is of this recorder.
         self._left_open, self._first = True, sys.maxsize
         self._closer: BackgroundJob | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
         self._not_before = self._told_until = self._look_at = 0.0
-        self._syncer = Syncer(config.sync_s)
+        self._syncer = segments.Syncer(config.sync_s)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -149,7 +129,7 @@ class Recorder:
         Returns False if they were dropped, because the queue is full or the recorder is closed. Raises InputError on
         unequal lengths.
         """
-        rows = rows_of(seq, t_s, u_V, y_um, reason)
+        rows = segments.rows_of(seq, t_s, u_V, y_um, reason)
         with self._lock:
             self._counts["offered"] += len(rows)
             rows["index"] = self.index + np.arange(len(rows))
@@ -222,7 +202,7 @@ class Recorder:
         self._close_all()
         self._folder.release()
 
-    def _take(self) -> list[Rows]:
+    def _take(self) -> list[segments.Rows]:
         with self._lock:
             taken = list(self._queue)
             self._queue.clear()
@@ -243,15 +223,15 @@ class Recorder:
         self._not_before = time.monotonic() + self.config.retry_s
         self._failed(error.strerror or str(error))
 
-    def _begin_segment(self) -> Journal:
+    def _begin_segment(self) -> segments.Journal:
         directory = self.config.directory
         self._folder.take()
-        self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
-        number = next_number(directory)
+        self._count(removed=segments.make_room(directory, self.config.max_bytes, self.config.journal_bytes))
+        number = segments.next_number(directory)
         self._first = min(self._first, number)
-        return Journal(journal_of(directory, number))
+        return segments.Journal(segments.journal_of(directory, number))
 
-    def _write(self, rows: Rows) -> None:
+    def _write(self, rows: segments.Rows) -> None:
         # After a failure: pause, except at the end, where one more attempt costs nothing.
         if time.monotonic() < self._not_before and not self._stop:
             self._count(lost=len(rows))
@@ -300,18 +280,18 @@ class Recorder:
         closer = self._closer
         if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
             self._left_open = False
-            self._closer = closing(self.config.directory, self._segment.path)
+            self._closer = segments.closing(self.config.directory, self._segment.path)
         elif closer is not None and not closer.running:
             self._closer = None
-            self._take_result(lambda: closed_by(closer))
+            self._take_result(lambda: segments.closed_by(closer))
 
     def _take_result(self, closed: Callable[[], list[Path]]) -> None:
         """``closed`` : returns the segments that were closed; raises OSError."""
         try:
             made = closed()
-            own = sum(number_of(path) >= self._first for path in made)
+            own = sum(segments.number_of(path) >= self._first for path in made)
             written = sum(path.stat().st_size for path in made)
-            removed = make_room(self.config.directory, self.config.max_bytes)
+            removed = segments.make_room(self.config.directory, self.config.max_bytes)
             self._count(bytes=written, segments=own, salvaged=len(made) - own, removed=removed)
         except OSError as error:
             self._left_open = True
@@ -321,12 +301,12 @@ class Recorder:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
         if self._closer is not None:
             self._closer.cancel()
-        if not left_open(self.config.directory):
+        if not segments.left_open(self.config.directory):
             return
 
         def closed() -> list[Path]:
             # One that has recorded nothing holds no folder yet, and leaves another's alone.
             self._folder.take()
-            return close_left_open(self.config.directory)
+            return segments.close_left_open(self.config.directory)
 
         self._take_result(closed)

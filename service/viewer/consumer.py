@@ -12,13 +12,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeGuard
+from typing import Annotated, Any, Final, TypeGuard
 
 import numpy as np
 import zenoh
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.security.authenticator import own_authenticator
@@ -120,12 +121,11 @@ class ConsumerConfig:
     model: str = "lssvm_adaptive"
     twins: tuple[tuple[str, str], ...] = ()
     changes_s: tuple[float, ...] = ()
-    batch_s: float = 0.2
+    batch_s: Annotated[float, Setting(unit="s", low=0.05, high=5.0)] = 0.2
     inbox: int = 20_000
 
     def __post_init__(self) -> None:
-        if not 0.05 <= self.batch_s <= 5.0:
-            raise InputError(f"batch_s: got {self.batch_s!r} s, expected 0.05 to 5")
+        check_bounds(self)
         axes = [self.axis, *(axis for axis, _ in self.twins)]
         if len(set(axes)) != len(axes) or len(set(self.models)) != len(axes):
             raise InputError(
@@ -156,18 +156,12 @@ class Consumer:
         self._next_health = 0.0
         self._changes_s = sorted(config.changes_s)
         self._stop = threading.Event()
-        self._lock = threading.Lock()
         self._subscribers = [
             session.declare_subscriber(key, self._callback(kind, model, key))
             for kind, model, key in _subscriptions(config)
         ]
         self._thread = threading.Thread(target=self._run, name="view-batches")
         self._thread.start()
-
-    def pump(self) -> None:
-        """Decode the waiting messages and offer them as one batch; the thread does this every ``batch_s``."""
-        with self._lock:
-            self._offer(everything=False)
 
     def close(self) -> None:
         """Unsubscribe, pass on the rest, end the thread. May be called twice."""
@@ -177,9 +171,8 @@ class Consumer:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-            with self._lock:
-                self._next_health = 0.0
-                self._offer(everything=True)
+            self._next_health = 0.0
+            self._offer(everything=True)
 
     def _callback(self, kind: str, model: str, key: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
@@ -195,9 +188,10 @@ class Consumer:
 
     def _run(self) -> None:
         while not self._stop.wait(self.config.batch_s):
-            self.pump()
+            self._offer(everything=False)
 
     def _offer(self, everything: bool) -> None:
+        """Decode the waiting messages and offer them as one batch."""
         said: list[Record] = []
         # Only what waits now, so that a flood of messages does not keep this loop running.
         for _ in range(len(self._inbox)):
@@ -252,22 +246,21 @@ class Consumer:
     def _clock(self, samples: wire.SampleBatch) -> None:
         """Keep the newest pair of sequence number and time of the stage, and the sample time."""
         t_s, seq = float(samples.t_s[-1]), int(samples.seq[-1])
-        if not _is_time(t_s):
-            return
-        if seq > self._seq and t_s > self._t_s:
-            self._dt_s = (t_s - self._t_s) / (seq - self._seq)
-        self._t_s, self._seq = t_s, seq
+        if _is_time(t_s):
+            if seq > self._seq and t_s > self._t_s:
+                self._dt_s = (t_s - self._t_s) / (seq - self._seq)
+            self._t_s, self._seq = t_s, seq
 
     def _when(self, fields: Mapping[str, Any]) -> tuple[float, int]:
         """Time and number of a message: from its fields, from the time of its number, or those of the newest sample."""
         t_s, seq = fields.get("t_s"), fields.get("seq")
-        if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq <= wire.MAX_SEQ:
-            return (float(t_s) if _is_time(t_s) else self._t_s), self._seq
+        numbered = isinstance(seq, int) and not isinstance(seq, bool) and 0 <= seq <= wire.MAX_SEQ
+        number = int(seq) if numbered else self._seq  # type: ignore[arg-type]
+        ago_s = (self._seq - number) * self._dt_s
         if _is_time(t_s):
-            return float(t_s), seq
-        ago_s = (self._seq - seq) * self._dt_s
+            return float(t_s), number
         # A number from before a restart of the stage has no time here; one that is slightly ahead does.
-        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), seq
+        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), number
 
 
 def _is_time(value: Any) -> TypeGuard[float]:

@@ -20,10 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from dehyst.adaptive.errors import InputError
 from dehyst.service.background.job import step_back
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.viewer.records import Record, SceneConfig
 
@@ -44,15 +45,14 @@ class OutputConfig:
     rrd: Path | None = None
     connect: str | None = None
     recording_id: str | None = None
-    queue_batches: int = 100
+    queue_batches: Annotated[int, Setting(low=1)] = 100
 
     def __post_init__(self) -> None:
         if (self.rrd is None) == (self.connect is None):
             raise InputError(f"rrd, connect: got {self.rrd!r} and {self.connect!r}, expected exactly one of them")
         if self.connect is not None and not _URL.match(self.connect):
             raise InputError(f"connect: got {self.connect!r}, expected such as rerun+http://127.0.0.1:9876/proxy")
-        if self.queue_batches < 1:
-            raise InputError(f"queue_batches: got {self.queue_batches}, expected at least 1")
+        check_bounds(self)
 
     @property
     def name(self) -> str:

@@ -58,14 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
-    from dehyst.service.identification.identifying import (
-        NAMES,
-        Stretch,
-        draw_identification,
-        identify_all,
-        split_at,
-        thinning,
-    )
+    from dehyst.service.identification import identifying
+    from dehyst.service.identification.identifying import NAMES, Stretch
     from dehyst.service.storage.model_file import BundleMeta, write_bundle
     from dehyst.service.storage.output import check_file
     from dehyst.sim.recordings import check, repaired, require_usable
@@ -95,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     for line in whole_repaired.done:
         say(f"  repaired: {line}")
     dt_s = recording.dt_s
-    every = thinning(len(whole_repaired.valid), dt_s, args.fit_samples)
+    every = identifying.thinning(len(whole_repaired.valid), dt_s, args.fit_samples)
     if every > 1:
         say(
             f"  long recording: fits and errors use one of {every} samples, one each {dt_s * every:g} s; motion "
@@ -117,12 +111,12 @@ def run(args: argparse.Namespace) -> int:
         train, test, again = whole, Stretch.of(repaired(tested), every), None
         judged_on = str(args.test)
     else:
-        split = split_at(len(whole), args.holdout)
+        split = identifying.split_at(len(whole), args.holdout)
         train, test = whole.part(0, split), whole.part(split, len(whole))
         again = None if args.keep_apart else whole
         judged_on = f"the last {100 * args.holdout:g} % of the recording"
 
-    results = identify_all(
+    results = identifying.identify_all(
         train, test, dt_s * every, follows=args.test is None, whole=again, names=names, n=args.support,
         most=args.fit_samples, serve_dt_s=dt_s, progress=_progress(say, names, len(train), len(again or train)),
     )  # fmt: skip
@@ -147,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     write_bundle(args.out, models, meta)
     if picture is not None:
         title = f"{args.data.name}: inverse models, judged on {judged_on}"
-        draw_identification(picture, title, train, test, dt_s * every, results, gain)
+        identifying.draw_identification(picture, title, train, test, dt_s * every, results, gain)
     summary: dict[str, Any] = {
         "data": str(args.data),
         "sha256": sha256,

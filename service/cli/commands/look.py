@@ -72,21 +72,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _columns(table: Table) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "unit": table.units.get(name), "shape": list(array.shape), **_range(array)}
-        for name, array in table.arrays.items()
-    ]
-
-
-def _range(array: NDArray[Any]) -> dict[str, Any]:
-    """Smallest, largest and missing values of numbers; of texts the first one."""
-    if array.dtype.kind not in "fiub" or not array.size:
-        return {"min": None, "max": None, "missing": 0, "first": str(array.reshape(-1)[0])[:40] if array.size else None}
-    values = np.asarray(array, dtype=np.float64)
-    good = values[np.isfinite(values)]
-    if not good.size:
-        return {"min": None, "max": None, "missing": int(values.size), "first": None}
-    return {"min": float(good.min()), "max": float(good.max()), "missing": int(values.size - good.size), "first": None}
+    """Each column: smallest, largest and missing values of numbers; of texts the first one."""
+    found = []
+    for name, array in table.arrays.items():
+        numbers = array.dtype.kind in "fiub"
+        values = np.asarray(array if numbers else (), dtype=np.float64)
+        good = values[np.isfinite(values)]
+        ends = {"min": float(good.min()), "max": float(good.max())} if good.size else {"min": None, "max": None}
+        first = None if numbers or not array.size else str(array.reshape(-1)[0])[:40]
+        about = {"name": name, "unit": table.units.get(name), "shape": list(array.shape)}
+        found.append({**about, **ends, "missing": int(values.size - good.size), "first": first})
+    return found
 
 
 def _understood(recording: Recording) -> dict[str, Any]:

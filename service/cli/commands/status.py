@@ -96,25 +96,24 @@ def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) 
         f"{ROOT}/{args.stage}/{args.axis}/event", lambda sample: events.append(_event(sample))
     )
     on_screen = sys.stdout.isatty() and not args.json
-    until = None if args.duration is None else time.monotonic() + args.duration
+
+    def show(answers: list[dict[str, Any]]) -> None:
+        found = in_order([*answers, *standbys.statuses()])
+        if args.json:
+            print(json.dumps({"schema": 1, "time_unix_s": time.time(), "axes": found}), flush=True)
+        elif on_screen:
+            print(screen(found, args.endpoint, list(events)), end="", flush=True)
+        else:
+            print(f"{table(found)}\n", flush=True)
+
     # A flag, no exception: an exception that a signal raises inside a finalizer is lost.
     stop = StopSignal()
     try:
         if on_screen:
             print("\x1b[?1049h\x1b[?25l", end="")  # the terminal's alternate screen, without a cursor
-        found = in_order([*_settled(session, args), *standbys.statuses()])
-        while not stop.reason and (until is None or time.monotonic() < until):
-            if args.json:
-                print(json.dumps({"schema": 1, "time_unix_s": time.time(), "axes": found}), flush=True)
-            elif on_screen:
-                print(screen(found, args.endpoint, list(events)), end="", flush=True)
-            else:
-                print(f"{table(found)}\n", flush=True)
-            stop.wait(args.period)
-            if stop.reason:
-                break
-            answers = statuses(session, args.stage, args.axis, args.timeout)
-            found = in_order([*answers, *standbys.statuses()])
+        show(_settled(session, args))
+        for _ in stop.every(args.period, args.duration):
+            show(statuses(session, args.stage, args.axis, args.timeout))
     except BrokenPipeError:
         sys.stdout = None  # the reader has closed the pipe; there is nothing to flush to
     finally:

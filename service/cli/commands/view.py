@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import math
 import subprocess
-import time
 import uuid
 from pathlib import Path
 
@@ -145,9 +143,7 @@ def twins(given: list[str]) -> tuple[tuple[str, str], ...]:
 
 def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
     """Wait for a signal, the end of the time, or the end of the spawned viewer where there is no file (``alone``)."""
-    until = math.inf if duration_s is None else time.monotonic() + duration_s
-    while not stop.reason and time.monotonic() < until:
-        stop.wait(0.1)
+    for _ in stop.every(0.1, duration_s):
         ended = None if viewer is None else viewer.poll()
         if ended:
             raise ServiceError(
