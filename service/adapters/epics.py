@@ -25,7 +25,7 @@ import zenoh
 
 from dehyst.adaptive.errors import DehystError
 from dehyst.service.adapters.adapter import load_library
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_epilog, add_shared, check_number
 from dehyst.service.operating.remote import operate, statuses
 from dehyst.service.protocol.errors import FieldError, ServiceError
 from dehyst.service.protocol.keys import AUTO, Keys
@@ -174,10 +174,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the variables until Ctrl-C or SIGTERM. Returns 0."""
     stop = StopSignal()
-    if not (math.isfinite(args.every) and args.every > 0.0):
-        raise FieldError("--every", args.every, "a positive time in s")
-    if not 1 <= args.port <= 65534:
-        raise FieldError("--port", args.port, "1 to 65534")
+    check_number("--every", args.every, "s", low=0, above=True)
+    check_number("--port", args.port, low=1, high=65_534)
     if not args.insecure_beyond_loopback and not is_loopback(f"tcp/{args.interface}:{args.port}"):
         raise FieldError(
             "--interface", repr(args.interface), "an address of this machine, such as 127.0.0.1",

@@ -8,7 +8,7 @@ import math
 import sys
 from typing import Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
 from dehyst.service.cli.python_file import load_object
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
     check_name("--stage", args.stage)
     check_name("--axis", args.axis)
     for option, value in (("--target", args.target), ("--duration", args.duration), ("--slew", args.slew)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise FieldError(option, value, "a positive number")
+        check_number(option, value, low=0, above=True)
     if args.gain == 0.0 or math.isinf(args.gain):
         raise FieldError("--gain", args.gain, "µm/V other than 0")
     order = Order(

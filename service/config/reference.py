@@ -27,8 +27,6 @@ _HEAD = """\
 # Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s. Paths are relative to it.
 """
 _WIDTH = 36
-#: Nested dataclasses that have a table of their own on the page.
-_OWN_TABLES = (CompetitionConfig, CorrectionConfig, RepetitionConfig, RetuningConfig, WatchConfig)
 _TITLE = """\
 # Configuration of `dehyst serve`
 
@@ -94,7 +92,7 @@ def _rows(kind: type, prefix: str) -> list[str]:
     for key in _flat(kind):
         if not _is_table(key):
             rows.append((f"`{prefix}{key.name}`", _values(key), described.get(key.name, "")))
-        elif isinstance(key.type, type) and key.type not in _OWN_TABLES:
+        elif isinstance(key.type, type) and key.type not in dict(tables()).values():
             nested += _rows(key.type, f"{prefix}{key.name}.")
     return [*head, *_lines(rows), *nested, *([] if prefix else [""])]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.sim.recordings import ColumnMap, Finding, Recording, load_map, read
 from dehyst.sim.recordings.columns import QUANTITIES, MissingError
@@ -81,8 +82,7 @@ def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
     names = ("dt_s", "sensor_late", "delimiter", "decimal", "header")
     scalars = {name: value for name in names if (value := getattr(args, name)) is not None}
     if args.rate is not None:
-        if not 0.0 < args.rate < 1e9:
-            raise FieldError("--rate", args.rate, "a positive number of samples per second")
+        check_number("--rate", args.rate, "Hz", low=0, above=True, high=1e9)
         scalars["dt_s"] = 1.0 / args.rate
     files = base.files | _pairs("--file", args.file, Path)
     if test:
@@ -116,8 +116,8 @@ def _pairs(option: str, texts: list[str], kind: Callable[[str], T]) -> dict[str,
                 raise ValueError
             pairs[quantity] = kind(value)
         except ValueError:
-            number = ", a number" if kind is float else ""
-            expected = f"QUANTITY=VALUE{number} with one of {', '.join(QUANTITIES)}"
+            number = "a number and " if kind is float else ""
+            expected = f"QUANTITY=VALUE with {number}one of {', '.join(QUANTITIES)}"
             raise FieldError(option, repr(text), expected) from None
     return pairs
 

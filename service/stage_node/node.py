@@ -185,14 +185,11 @@ class _Unit:
 
     def step(self, k: int) -> None:
         """Read, then apply. The sample holds the voltage that the stage really gets."""
-        if len(self.ports) == 1:
-            port = self.ports[0]
-            u_V = port.take(k)
-            port.write(k, u_V, self.stage.step(self.state, u_V)[0])
-            return
-        u_V, u2_V = (port.take(k) for port in self.ports)
-        for port, applied, y_um in zip(self.ports, (u_V, u2_V), self.stage.step(self.state, u_V, u2_V), strict=True):
-            port.write(k, applied, y_um)
+        applied_V = [port.take(k) for port in self.ports]
+        # Of a stage with two axes of which one is driven, the other reading goes nowhere.
+        readings_um = self.stage.step(self.state, *applied_V)
+        for port, u_V, y_um in zip(self.ports, applied_V, readings_um, strict=False):
+            port.write(k, u_V, y_um)
 
 
 class StageNode:

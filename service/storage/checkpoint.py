@@ -141,20 +141,17 @@ class CheckpointFolder:
         #: Until when checkpoints are kept, by their number, by ``time.monotonic``, s.
         self._pinned: dict[int, float] = {}
 
-    def pin(self, now_s: float, long_s: float) -> None:
-        """Keep all that are kept at ``now_s`` (``time.monotonic``) for ``long_s`` more; a full disk still takes them.
+    def pin(self, now_s: float, until_s: float) -> frozenset[int]:
+        """Keep all that stay by their age at ``now_s`` until ``until_s`` (``time.monotonic``) at least; their numbers.
 
-        One that is there only because it was pinned before is not pinned again: who lists them all the time must not
-        keep them all.
+        A full disk still takes them. One that is there only because it was pinned before is not pinned again: who lists
+        them all the time must not keep them all.
         """
         numbers = self.numbers()
         kept = self._regular(max(numbers, default=0), numbers)
-        pinned = {number: until_s for number, until_s in self._pinned.items() if until_s > now_s}
-        self._pinned = pinned | dict.fromkeys(kept, now_s + long_s)
-
-    def is_safe(self, number: int, now_s: float, long_s: float) -> bool:
-        """Whether a checkpoint stays for ``long_s`` more at least, but for a full disk."""
-        return self._pinned.get(number, 0.0) >= now_s + long_s
+        pinned = {number: end_s for number, end_s in self._pinned.items() if end_s > now_s}
+        self._pinned = pinned | dict.fromkeys(kept, until_s)
+        return frozenset(kept)
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
         """Write a checkpoint under the next number, atomically and synced. Raises OSError."""
@@ -265,9 +262,8 @@ def _read_meta(path: Path) -> CheckpointMeta:
 
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
-#: Time, s, for which checkpoints are kept after they were listed; one that has less than half of it left is no longer
-#: listed.
-LISTED_S: Final = 600.0
+#: Time, s, for which checkpoints are kept after they were listed.
+LISTED_S: Final = 300.0
 _PORTION = 100
 
 
@@ -320,12 +316,9 @@ class CheckpointKeeper:
             self.copy_now()
 
     def keep_listed(self) -> frozenset[int]:
-        """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S` / 2."""
-        folder, now_s = self.folder, self._clock()
-        if folder is None:
-            return frozenset()
-        folder.pin(now_s, LISTED_S)
-        return frozenset(number for number in folder.numbers() if folder.is_safe(number, now_s, 0.5 * LISTED_S))
+        """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S`."""
+        now_s = self._clock()
+        return frozenset() if self.folder is None else self.folder.pin(now_s, now_s + LISTED_S)
 
     def copy_now(self) -> None:
         """Copy the present state, to be written. Call it in the thread that handles samples."""

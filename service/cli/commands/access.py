@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_epilog, add_shared, check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.security import access
 
@@ -48,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write or list the files. Returns 0."""
-    if not 1 <= args.days <= 36_500:
-        raise FieldError("--days", args.days, "1 to 36500 days")
+    check_number("--days", args.days, "days", low=1, high=36_500)
     users, stages = _named(args)
     if args.what == "init":
         if not users:

@@ -45,15 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         test={"help": "another recording of the stage, same columns: nothing is fitted, the verdict is its own"},
         seed={"help": "seed of the null distribution (%(default)s)"},
     )
-    # It used to leave out a file that is written no more.
-    parser.add_argument("--no-rrd", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--schema",
-        type=int,
-        choices=(1, 2),
-        default=2,
-        help="schema of report.json: 1 has no verdict partly, no direct tests, no black box (%(default)s)",
-    )
     add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser, test=True)
 
@@ -94,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         test="" if args.test is None else args.test.name,
         nominal=str(args.stage.name) if args.stage is not None else args.nominal,
     )
-    data = write_report(args.out, diagnosis, source, schema=args.schema)
+    data = write_report(args.out, diagnosis, source)
     say(f"[100 %] done in {time.perf_counter() - start:.1f} s")
     print(json.dumps(data) if args.json else summary(data, args.out))
     return 0

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
@@ -69,10 +69,8 @@ def run(args: argparse.Namespace) -> int:
     names = tuple(args.models.split(",")) if args.models else NAMES
     if unknown := [name for name in names if name not in NAMES]:
         raise FieldError("--models", repr(unknown[0]), f"some of {', '.join(NAMES)}")
-    if args.support < 10:
-        raise FieldError("--support", args.support, "at least 10 support vectors")
-    if args.fit_samples < 1000:
-        raise FieldError("--fit-samples", args.fit_samples, "at least 1000 samples")
+    check_number("--support", args.support, "support vectors", low=10)
+    check_number("--fit-samples", args.fit_samples, "samples", low=1000)
     picture = None if args.no_pictures else args.picture or args.out.with_suffix(".png")
     check_file("--out", args.out)
     if picture is not None:

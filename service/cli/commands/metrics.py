@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from dehyst.service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
-from dehyst.service.protocol.errors import FieldError
+from dehyst.service.cli.options import (
+    add_connection,
+    add_epilog,
+    add_selection,
+    add_shared,
+    check_number,
+    check_selection,
+)
 
 EPILOG = """\
 Grafana: import deploy/grafana-dashboard.json. Names and alarms: docs/monitoring.md.
@@ -30,8 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the page until interrupted. Returns 0. Raises InputError where the package or the port is missing."""
     check_selection(args)
-    if not 0 <= args.port <= 65535:
-        raise FieldError("--port", args.port, "0 to 65535")
+    check_number("--port", args.port, low=0, high=65_535)
     from dehyst.service.operating.metrics import page, serve_page
     from dehyst.service.operating.remote import statuses
     from dehyst.service.runtime.session import open_client

@@ -8,9 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from
-from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
 For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
@@ -50,8 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from dehyst.sim.modal import FitSettings, study
     from dehyst.sim.modal.reading import read_periodic
 
-    if args.start_modes < 1:
-        raise FieldError("--start-modes", args.start_modes, "1 or more")
+    check_number("--start-modes", args.start_modes, low=1)
     say = progress_printer(args.quiet)
     start = time.perf_counter()
     mapping = mapping_from(args)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
 from dehyst.service.protocol.errors import FieldError
 
@@ -61,8 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from dehyst.service.storage.output import clear_output
 
     say = progress_printer(args.quiet)
-    if not args.window > 0.0:
-        raise FieldError("--window", args.window, "a time above 0 s")
+    check_number("--window", args.window, "s", low=0, above=True)
     found: LearnerSettings = read_learner_settings(args.config, args.axis)
     path = args.model if args.model is not None else found.axis.model if found.axis is not None else None
     if path is None:

@@ -9,7 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_epilog, add_shared, check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from dehyst.service.runtime.stopping import StopSignal
@@ -46,22 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--batch", type=int, default=1, metavar="N", help="samples in a message; more for a slow network (%(default)s)")
     add_shared(parser, "duration", seed={"default": None, "help": "seed of its noise and drift (the stage's own)"})
     add("--free-run", action="store_true", help="start at once, at 0 V until commands come")
-    add(
-        "--change",
-        action="append",
-        default=[],
-        metavar="T:NAME=VALUE[,...]",
-        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; repeatable",
-    )
+    add("--change", action="append", default=[], metavar="T:NAME=VALUE[,...]",
+        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; repeatable")  # fmt: skip
     add("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (%(default)s)")
     add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
-    add(
-        "--lock-step",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="let the clock stand still until a voltage comes, for at most so long, s (0: it never waits)",
-    )
+    add("--lock-step", type=float, default=0.0, metavar="S",
+        help="let the clock stand still until a voltage comes, for at most so long, s (0: it never waits)")  # fmt: skip
     add("--examples", type=Path, metavar="DIR", help="write the files that the examples of --help name, and exit")
     add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
     add_shared(parser, "zenoh-config", "key", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
@@ -94,8 +84,7 @@ def stage_config(args: argparse.Namespace) -> StageConfig:
 
         config = preset(args.preset)
     if args.rate is not None:
-        if not (math.isfinite(args.rate) and args.rate > 0.0):
-            raise FieldError("--rate", args.rate, "a positive sample rate in Hz")
+        check_number("--rate", args.rate, "Hz", low=0, above=True)
         config = replace(config, dt_s=1.0 / args.rate)
     if args.seed is not None:
         config = replace(config, seed=args.seed)
@@ -114,8 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
     stop = StopSignal(raising=True)
     config = stage_config(args)
-    if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0.0):
-        raise FieldError("--duration", args.duration, "a positive time in s")
+    check_number("--duration", args.duration, "s", low=0, above=True)
     twins = [name.strip() for name in args.twins.split(",") if name.strip()]
     node_config = NodeConfig(
         stage=config,

@@ -11,10 +11,17 @@ from typing import Any
 
 import zenoh
 
-from dehyst.service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
+from dehyst.service.cli.options import (
+    add_connection,
+    add_epilog,
+    add_selection,
+    add_shared,
+    check_number,
+    check_selection,
+)
 from dehyst.service.operating.remote import Standbys, in_order, screen, statuses, table, warnings
 from dehyst.service.protocol.container import fields_of
-from dehyst.service.protocol.errors import FieldError, SessionError
+from dehyst.service.protocol.errors import SessionError
 from dehyst.service.protocol.keys import ROOT
 from dehyst.service.runtime.session import open_client
 from dehyst.service.runtime.stopping import StopSignal
@@ -47,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Show the table. Returns 0, or 1 where --once finds no service; Ctrl-C ends the live table with 0."""
     check_selection(args)
-    if not 0.1 <= args.period <= 3600.0:
-        raise FieldError("--period", args.period, "0.1 to 3600 s")
+    check_number("--period", args.period, "s", low=0.1, high=3600.0)
     try:
         opened = open_client(args.endpoint, args.wait, args.zenoh_config)
     except SessionError as error:

@@ -8,6 +8,7 @@ import logging
 import subprocess
 import uuid
 from pathlib import Path
+from typing import Any
 
 from dehyst.adaptive.errors import InputError
 from dehyst.service.cli.options import add_connection, add_epilog, add_shared
@@ -38,40 +39,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_connection(parser, wait_s=10.0, timeout_s=None)
     add_shared(parser, "stage", axis={"help": "axis that the service serves and learns from (%(default)s)"})
     add("--model", default="lssvm_adaptive", help="model that steers the axis; names its curves (%(default)s)")
-    add(
-        "--twin",
-        action="append",
-        default=[],
-        metavar="NAME=MODEL",
-        help="another axis of the stage, steered by MODEL, to compare with; repeatable",
-    )
-    add(
-        "--change-at",
-        type=float,
-        action="append",
-        default=[],
-        metavar="S",
-        help="mark a change of the stage at this time of the stage, s; repeatable",
-    )
+    many: dict[str, Any] = {"action": "append", "default": []}
+    add("--twin", **many, metavar="NAME=MODEL", help="another axis, steered by MODEL, to compare with; repeatable")
+    add("--change-at", **many, type=float, metavar="S", help="mark a change of the stage at this time, s; repeatable")
     add("--rrd", type=Path, metavar="FILE", help="write an .rrd, overwriting FILE")
-    add(
-        "--connect",
-        nargs="?",
-        const=DEFAULT_URL,
-        metavar="URL",
-        help=f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)",
-    )
+    at = f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)"
+    add("--connect", nargs="?", const=DEFAULT_URL, metavar="URL", help=at)
     add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays open")
     add("--web", action="store_true", help="serve Rerun's web viewer and stream to it; ends with this command")
     add("--port", type=int, default=9876, help="port of the started viewer, loopback only (%(default)s)")
     add("--web-port", type=int, default=9090, help="port of the page of --web, loopback only (%(default)s)")
     add("--range-um", type=float, metavar="UM", help="range for percentages, µm (span of the reference so far)")
-    add(
-        "--history",
-        type=float,
-        metavar="S",
-        help=f"past that the plots show, s; 0 for all (all in a file, {LIVE_HISTORY_S:g} live)",
-    )
+    past = f"past that the plots show, s; 0 for all (all in a file, {LIVE_HISTORY_S:g} live)"
+    add("--history", type=float, metavar="S", help=past)
     add("--batch", type=float, default=0.2, metavar="S", help="period of sending, s, 0.05 to 5 (%(default)s)")
     add_shared(parser, "duration", json={"help": "print the counts at the end as JSON"})
 

@@ -197,7 +197,7 @@ def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back
         now_s[0] += 7.0
         kept.write(meta(axis), {"seq": 1})
         shown |= dict.fromkeys(listed(), now_s[0])
-        assert {number for number, at_s in shown.items() if at_s >= now_s[0] - 0.5 * LISTED_S} <= set(kept.numbers())
+        assert {number for number, at_s in shown.items() if at_s >= now_s[0] - LISTED_S} <= set(kept.numbers())
     assert len(kept.numbers()) < 150
     keeper.close()
 
