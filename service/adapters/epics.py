@@ -1,16 +1,9 @@
 """``dehyst epics``: one axis of a service as EPICS process variables, over PVAccess, through `p4p`.
 
-| variable | type | |
-|---|---|---|
-| ``PREFIX:STATUS`` | string | ``ok``, ``stale``, ``frozen``, ``no_service``, or the name of the trouble |
-| ``PREFIX:TRUST`` | double | weight of the learning model, 0 to 1 |
-| ``PREFIX:MODEL_ERROR`` | double, % | recent error of the learning model, in percent of the voltage span |
-| ``PREFIX:SAMPLE`` | long | number of the last sample that the service has handled |
-| ``PREFIX:SERVED`` | string | the model that answers where a query names none |
-| ``PREFIX:FREEZE`` | bool, writable | 1 stops learning, 0 lets it go on |
-| ``PREFIX:ENABLE`` | bool, writable | 0 serves the mean gain (``linear``), 1 the model that was served before |
+The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
+PVAccess knows no passwords: everybody who reaches the address may freeze the axis. Needs p4p (pip install p4p).
 
-Variables of an axis whose service does not answer have the alarm INVALID. Sources: documentation of p4p 4.
+  dehyst epics --prefix LAB:STAGE:X
 """
 
 from __future__ import annotations
@@ -25,7 +18,7 @@ import zenoh
 
 from dehyst.adaptive.errors import DehystError
 from dehyst.service.adapters.adapter import load_library
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared, check_number
+from dehyst.service.cli.options import add_connection, add_shared, check_number
 from dehyst.service.operating.remote import operate, statuses
 from dehyst.service.protocol.errors import FieldError, ServiceError
 from dehyst.service.protocol.keys import AUTO, Keys
@@ -33,12 +26,6 @@ from dehyst.service.runtime.session import is_loopback, open_client
 from dehyst.service.runtime.stopping import StopSignal
 from dehyst.service.security.authenticator import own_authenticator
 
-EPILOG = """\
-The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
-PVAccess knows no passwords: everybody who reaches the address may freeze the axis. Needs p4p (pip install p4p).
-
-  dehyst epics --prefix LAB:STAGE:X
-"""
 #: The model that ENABLE = 0 serves.
 PLAIN: Final = "linear"
 _OK, _MAJOR, _INVALID = 0, 2, 3
@@ -52,6 +39,18 @@ _INITIAL: Final[dict[str, Any]] = {"s": "", "d": math.nan, "l": -1, "?": False}
 
 class EpicsAxis:
     """The process variables of one axis. Use as a context manager, and call :meth:`poll` once a period.
+
+    | variable | type | |
+    |---|---|---|
+    | ``PREFIX:STATUS`` | string | ``ok``, ``stale``, ``frozen``, ``no_service``, or the name of the trouble |
+    | ``PREFIX:TRUST`` | double | weight of the learning model, 0 to 1 |
+    | ``PREFIX:MODEL_ERROR`` | double, % | recent error of the learning model, in percent of the voltage span |
+    | ``PREFIX:SAMPLE`` | long | number of the last sample that the service has handled |
+    | ``PREFIX:SERVED`` | string | the model that answers where a query names none |
+    | ``PREFIX:FREEZE`` | bool, writable | 1 stops learning, 0 lets it go on |
+    | ``PREFIX:ENABLE`` | bool, writable | 0 serves the mean gain (``linear``), 1 the model that was served before |
+
+    Variables of an axis whose service does not answer have the alarm INVALID. Sources: documentation of p4p 4.
 
     Parameters
     ----------
@@ -160,7 +159,6 @@ def _handler(command: Callable[[bool], None]) -> Callable[[Any, Any], None]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst epics``."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--prefix", required=True, metavar="NAME", help="of the variables' names, such as LAB:STAGE:X")
     add_shared(parser, "stage", "axis")

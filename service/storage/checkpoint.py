@@ -23,14 +23,7 @@ from dehyst.adaptive.state import Entry, load
 from dehyst.adaptive.types import OnlineModel, StateDict, joined, under
 from dehyst.service.intake.sample_queue import SampleQueue
 from dehyst.service.operating.server import Switch
-from dehyst.service.protocol.container import (
-    MAX_HEADER_BYTES,
-    UNITS,
-    decode_body,
-    decode_header,
-    encode_body,
-    split_state,
-)
+from dehyst.service.protocol import container
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
@@ -65,7 +58,7 @@ class CheckpointMeta:
     models: Annotated[dict[str, str], Entry("digests of the models in the model file that it grew from")] = field(
         default_factory=dict
     )
-    units: Annotated[dict[str, str], Entry("those of the model file")] = field(default_factory=lambda: dict(UNITS))
+    units: Annotated[dict[str, str], Entry("those of the model file")] = field(default_factory=container.UNITS.copy)
 
     @classmethod
     def of(cls, header: Mapping[str, Any]) -> CheckpointMeta:
@@ -84,7 +77,7 @@ class CheckpointMeta:
             ("stage", self.stage, stage),
             ("axis", self.axis, axis),
             ("sample time", self.dt_s, dt_s),
-            ("units", self.units, UNITS),
+            ("units", self.units, container.UNITS),
         ):
             if got != wanted:
                 raise ModelFileError(f"{name} is {got!r}, expected {wanted!r}")
@@ -99,8 +92,8 @@ class CheckpointMeta:
 
 def encode_checkpoint(meta: CheckpointMeta, state: StateDict) -> list[Any]:
     """The bytes of a checkpoint as buffers in order; arrays are not copied."""
-    values, arrays = split_state(state)
-    body = encode_body({"meta": asdict(meta), "values": values}, arrays)
+    values, arrays = container.split_state(state)
+    body = container.encode_body({"meta": asdict(meta), "values": values}, arrays)
     digest = hashlib.blake2b(digest_size=16)
     for buffer in body:
         digest.update(buffer)
@@ -118,7 +111,7 @@ def decode_checkpoint(data: bytes) -> tuple[CheckpointMeta, StateDict]:
     if length > len(body) or hashlib.blake2b(body, digest_size=16).digest() != digest:
         raise ModelFileError("damaged or cut off: its digest does not match")
     try:
-        header, arrays = decode_body(body, length, len(body))
+        header, arrays = container.decode_body(body, length, len(body))
         return CheckpointMeta.of(header), dict(header["values"]) | arrays
     except (ValueError, KeyError, TypeError) as error:
         raise ModelFileError(f"its header is not valid: {error!r}") from error
@@ -247,10 +240,10 @@ def number_of(path: Path) -> int:
 def _read_meta(path: Path) -> CheckpointMeta:
     with open(path, "rb") as file:
         magic, length, _ = _HEAD.unpack(file.read(_HEAD.size).ljust(_HEAD.size))
-        if magic != MAGIC or length > MAX_HEADER_BYTES:
+        if magic != MAGIC or length > container.MAX_HEADER_BYTES:
             raise ModelFileError("not a checkpoint")
         try:
-            return CheckpointMeta.of(decode_header(file.read(length)))
+            return CheckpointMeta.of(container.decode_header(file.read(length)))
         except ValueError as error:
             raise ModelFileError(f"its header is not valid: {error}") from error
 

@@ -1,18 +1,5 @@
-"""``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain."""
+"""``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain.
 
-from __future__ import annotations
-
-import argparse
-import json
-import time
-from pathlib import Path
-from typing import Any
-
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
-from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
-from dehyst.service.protocol.errors import FieldError
-
-EPILOG = """\
 Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
 extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
@@ -23,12 +10,25 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
   dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
       --out out/diagnosis
   dehyst diagnose train.csv --nominal linear --range 0:10 --out out/diagnosis --json
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
 """
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from dehyst.service.cli.options import add_shared, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst diagnose``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "help": "folder for the report"})
     what = parser.add_mutually_exclusive_group()

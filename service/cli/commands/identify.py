@@ -1,4 +1,15 @@
-"""``dehyst identify``: the inverse models of a stage from a recording."""
+"""``dehyst identify``: the inverse models of a stage from a recording.
+
+Errors are of the inverse: the model gets the measured motion of data it has not seen, and its voltage is compared with
+the applied one. The error in µm is that voltage error times the mean gain of the stage.
+
+  dehyst identify recording.csv --out stage.npz
+  dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
+      --out stage.npz
+  dehyst identify train.csv --test test.csv --range 1:11 --out stage.npz
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
@@ -23,20 +34,9 @@ CLIPPED = ("clipped", "warning")
 
 log = logging.getLogger("dehyst.identify")
 
-EPILOG = """\
-Errors are of the inverse: the model gets the measured motion of data it has not seen, and its voltage is compared with
-the applied one. The error in µm is that voltage error times the mean gain of the stage.
-
-  dehyst identify recording.csv --out stage.npz
-  dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
-      --out stage.npz
-  dehyst identify train.csv --test test.csv --range 1:11 --out stage.npz
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst identify``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "metavar": "MODEL.npz", "help": "file for the models"})
     judged = parser.add_mutually_exclusive_group()

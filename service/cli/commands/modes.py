@@ -1,4 +1,15 @@
-"""``dehyst modes``: the modes of a stage from periodic recordings, and how they change with the amplitude."""
+"""``dehyst modes``: the modes of a stage from periodic recordings, and how they change with the amplitude.
+
+For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
+amplitude, at least as many realisations as drives. Recordings of the same rms count as realisations of one amplitude.
+Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/modes.md).
+
+  dehyst modes low.npz high.npz --column u=u --unit u=V --column rate=fs_hz --out out/modes
+  dehyst modes a.csv b.csv c.csv --column u=CH1,CH2,CH3 --unit u=V --column y=X,Y --unit y=nm --period 8192 \\
+      --skip-periods 1 --out out/modes
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +19,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from
-
-EPILOG = """\
-For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
-amplitude, at least as many realisations as drives. Recordings of the same rms count as realisations of one amplitude.
-Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/modes.md).
-
-  dehyst modes low.npz high.npz --column u=u --unit u=V --column rate=fs_hz --out out/modes
-  dehyst modes a.csv b.csv c.csv --column u=CH1,CH2,CH3 --unit u=V --column y=X,Y --unit y=nm --period 8192 \\
-      --skip-periods 1 --out out/modes
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst modes``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, nargs="+", metavar="RECORDING", help="recordings to fit, of any amplitudes")
     add_shared(
         parser,

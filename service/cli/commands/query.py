@@ -1,4 +1,12 @@
-"""``dehyst query``: ask a running service for voltages, or for its status."""
+"""``dehyst query``: ask a running service for voltages, or for its status.
+
+  dehyst query 40                              # the voltage for 40 µm at rest
+  dehyst query 40 40.1 40.2 --model linear     # a trajectory, one sample time apart
+  dehyst query --from trajectory.csv --json    # columns y,v,a
+  dehyst query --status
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +21,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
     from dehyst.service.protocol.query import Trajectory
 
-EPILOG = """\
-  dehyst query 40                              # the voltage for 40 µm at rest
-  dehyst query 40 40.1 40.2 --model linear     # a trajectory, one sample time apart
-  dehyst query --from trajectory.csv --json    # columns y,v,a
-  dehyst query --status
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("y_um", nargs="*", type=float, help="desired displacements, µm, one sample time apart")
     add(

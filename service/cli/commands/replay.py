@@ -1,22 +1,5 @@
-"""``dehyst replay``: run the learner over a recording, offline, to see what it would do live."""
+"""``dehyst replay``: run the learner over a recording, offline, to see what it would do live.
 
-from __future__ import annotations
-
-import argparse
-import json
-import time
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from dehyst.service.cli.options import add_epilog, add_shared, check_number, progress_printer
-from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
-from dehyst.service.protocol.errors import FieldError
-
-if TYPE_CHECKING:
-    from dehyst.service.config.learner import LearnerSettings
-
-EPILOG = """\
 For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
 block. Errors are of the voltage for the measured motion: in V, in percent of the voltage span of identification, and in
 µm by the mean gain. The code is the same as live, and so are the snapshots.
@@ -29,12 +12,29 @@ The configuration is that of 'dehyst serve', or the learner's settings alone (do
 
   dehyst replay recordings/x --config serve.toml --out out/replay
   dehyst replay test.csv --config learner.toml --model stage.npz --sensor-late 1 --out out/replay
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
 """
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
+
+if TYPE_CHECKING:
+    from dehyst.service.config.learner import LearnerSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst replay``."""
-    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("data", type=Path, metavar="RECORDING", help="the recording: a file, or a folder of segments")
     add("--config", type=Path, required=True, metavar="FILE", help="TOML of 'dehyst serve', or of the learner alone")

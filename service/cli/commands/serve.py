@@ -1,4 +1,13 @@
-"""``dehyst serve``: the serving process."""
+"""``dehyst serve``: the serving process.
+
+All keys of the configuration: docs/configuration.md.
+
+  dehyst serve --example > serve.toml    # then set model file and limits
+  dehyst serve --config serve.toml
+  dehyst serve --config serve.toml --standby
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_shared
 from dehyst.service.config.settings import ServeConfig, read_config
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.descriptors import need_descriptors
@@ -21,14 +30,6 @@ from dehyst.service.security.refusals import count_refusals
 
 if TYPE_CHECKING:
     from dehyst.service.server.process import Service
-
-EPILOG = """\
-All keys of the configuration: docs/configuration.md.
-
-  dehyst serve --example > serve.toml    # then set model file and limits
-  dehyst serve --config serve.toml
-  dehyst serve --config serve.toml --standby
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "insecure-beyond-loopback", "duration")
     add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
-    add_epilog(parser, EPILOG, files=True)
 
 
 def run(args: argparse.Namespace) -> int:

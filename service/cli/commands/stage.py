@@ -1,4 +1,13 @@
-"""``dehyst stage``: a simulated stage as a process on zenoh."""
+"""``dehyst stage``: a simulated stage as a process on zenoh.
+
+The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
+Where a voltage is late, the stage repeats the last one and counts it. The last line printed is JSON: ticks, late
+ticks, and per axis the samples published and the commands received, late, missing and refused.
+
+  dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
+  dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
+  dehyst stage --examples .              # write the files that the examples of all commands name, and exit
+"""
 
 from __future__ import annotations
 
@@ -9,26 +18,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from dehyst.service.cli.options import add_epilog, add_shared, check_number
+from dehyst.service.cli.options import add_shared, check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from dehyst.service.runtime.stopping import StopSignal
 from dehyst.sim.stage.config import ParameterChange, StageConfig
 
-EPILOG = """\
-The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
-Where a voltage is late, the stage repeats the last one and counts it. The last line printed is JSON: ticks, late
-ticks, and per axis the samples published and the commands received, late, missing and refused.
-
-  dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
-  dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
-  dehyst stage --examples .              # write the files that the examples of all commands name, and exit
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst stage``."""
-    add_epilog(parser, EPILOG)
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--preset", default="rich", help="rich (default: stands in for hardware) or bouc_wen")
     what.add_argument("--file", type=Path, metavar="STAGE.toml", help="a stage file in place of a preset")

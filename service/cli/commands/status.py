@@ -1,4 +1,12 @@
-"""``dehyst status``: all axes and instances that serve, once or live."""
+"""``dehyst status``: all axes and instances that serve, once or live.
+
+  dehyst status                   # a live table; Ctrl-C ends it
+  dehyst status --once --json
+  dehyst status --check           # for a watchdog: see the exit status
+
+Exit status of --check: 0 every axis is ok; 1 an axis is not ok but answers as before (frozen, thinned, refusing,
+unsure, not learning); 2 usage error; 3 an axis is in trouble, stale or drops samples; 4 no service answers.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +19,7 @@ from typing import Any
 
 import zenoh
 
-from dehyst.service.cli.options import (
-    add_connection,
-    add_epilog,
-    add_selection,
-    add_shared,
-    check_number,
-    check_selection,
-)
+from dehyst.service.cli import options
 from dehyst.service.operating.remote import Standbys, in_order, screen, statuses, table, warnings
 from dehyst.service.protocol.container import fields_of
 from dehyst.service.protocol.errors import SessionError
@@ -29,32 +30,22 @@ from dehyst.service.runtime.stopping import StopSignal
 #: A little more than the period at which a standby publishes its status, s.
 _STANDBY_PERIOD_S = 1.2
 
-EPILOG = """\
-  dehyst status                   # a live table; Ctrl-C ends it
-  dehyst status --once --json
-  dehyst status --check           # for a watchdog: see the exit status
-
-Exit status of --check: 0 every axis is ok; 1 an axis is not ok but answers as before (frozen, thinned, refusing,
-unsure, not learning); 2 usage error; 3 an axis is in trouble, stale or drops samples; 4 no service answers.
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
-    add_connection(parser)
-    add_selection(parser)
+    options.add_connection(parser)
+    options.add_selection(parser)
     add("--check", action="store_true", help="print what needs attention, and exit: a health check, see below")
     add("--once", action="store_true", help="print the table once, and exit")
     add("--period", type=float, default=1.0, metavar="S", help="period of the live table, s (%(default)s)")
-    add_shared(parser, "duration", json={"help": "print JSON: once an object, live one a line"})
+    options.add_shared(parser, "duration", json={"help": "print JSON: once an object, live one a line"})
 
 
 def run(args: argparse.Namespace) -> int:
     """Show the table. Returns 0, or 1 where --once finds no service; Ctrl-C ends the live table with 0."""
-    check_selection(args)
-    check_number("--period", args.period, "s", low=0.1, high=3600.0)
+    options.check_selection(args)
+    options.check_number("--period", args.period, "s", low=0.1, high=3600.0)
     try:
         opened = open_client(args.endpoint, args.wait, args.zenoh_config)
     except SessionError as error:

@@ -1,4 +1,11 @@
-"""``dehyst view``: stream a running service to the Rerun viewer or into an .rrd file."""
+"""``dehyst view``: stream a running service to the Rerun viewer or into an .rrd file.
+
+What is drawn, and where in a file: docs/viewer.md.
+
+  dehyst view --spawn                           # a viewer on this machine
+  dehyst view --web                             # a page for a browser on this machine, without a display here
+  dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
+"""
 
 from __future__ import annotations
 
@@ -11,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.runtime.session import open_client
 from dehyst.service.runtime.stopping import StopSignal
@@ -25,16 +32,9 @@ DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 #: Past that live plots show by default, s; a file shows all.
 LIVE_HISTORY_S = 30.0
 
-EPILOG = """\
-  dehyst view --spawn                           # a viewer on this machine
-  dehyst view --web                             # a page for a browser on this machine, without a display here
-  dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser, wait_s=10.0, timeout_s=None)
     add_shared(parser, "stage", axis={"help": "axis that the service serves and learns from (%(default)s)"})

@@ -26,7 +26,6 @@ from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.axis_loop import AxisLoop
 from dehyst.service.server.axis_verbs import axis_verbs
-from dehyst.service.storage import checkpoint
 from dehyst.service.storage import model_file as modelfile
 from dehyst.service.storage.checkpoint import (
     LISTED_S,
@@ -115,7 +114,7 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
         foreign.unlink()
         assert any(words in e["detail"] for e in fresh.take_events() if e["event"] == "checkpoint_refused")
     with monkeypatch.context() as patched:
-        patched.setattr(checkpoint, "UNITS", {**UNITS, "y": "nm"})
+        patched.setitem(UNITS, "y", "nm")
         in_nm = kept.write(meta(axis), state)
     fresh = make_axis()
     assert restore_newest(fresh, kept) == 1
