@@ -164,7 +164,7 @@ def _changes(modes: Sequence[Mode], low_V: float, high_V: float) -> str:
     steady = [f"{mode.frequency_hz[0]:.4g}" for mode in modes if mode.finding == "steady"]
     lines = [f"- {mode.sentence(low_V, high_V)}" for mode in changing]
     if steady:
-        lines.append(f"- No measurable change: the modes at {', '.join(steady)} Hz.")
+        lines.append(f"- No measurable change: {_count(len(steady), 'mode')} at {', '.join(steady)} Hz.")
     return "\n".join(["## Change with the amplitude", "", *lines, "", CHANGES])
 
 

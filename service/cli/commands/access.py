@@ -1,16 +1,5 @@
-"""``dehyst access``: certificates and zenoh configurations for more than one machine."""
+"""``dehyst access``: certificates and zenoh configurations for more than one machine.
 
-from __future__ import annotations
-
-import argparse
-import json
-from pathlib import Path
-
-from dehyst.service.cli.options import add_epilog, add_shared, check_number
-from dehyst.service.protocol.errors import FieldError
-from dehyst.service.security import access
-
-EPILOG = """\
 roles:
 {roles}
 
@@ -24,10 +13,21 @@ Each NAME.json5 goes to the machine of that name and to no other.
 docs/access.md.
 """
 
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from dehyst.service.cli.options import add_shared, check_number
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.security import access
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    add_epilog(parser, EPILOG.format(roles="\n".join(f"  {name:<11} {line}" for name, line in access.ROLES.items())))
+    roles = "\n".join(f"  {name:<11} {line}" for name, line in access.ROLES.items())
+    parser.epilog = str(parser.epilog).format(roles=roles)
     parser.add_argument("what", choices=("init", "add", "remove", "list"), help="make a folder, change it, or show it")
     add_shared(parser, out={"default": Path("access"), "help": "the folder (%(default)s)"})
     parser.add_argument(
