@@ -126,6 +126,9 @@ def make_file(path: Path) -> None:
 
 def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None]) -> None:
     """The child process: draw batches until None comes or the parent is gone."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_after, args=(parent,), name="view-end", daemon=True).start()
     # Low priority, in a session of its own: drawing must not take processor time from the service.
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
@@ -135,9 +138,6 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None]) -> None
 
     sink = RerunSink(config.scene, rrd=config.rrd, connect=config.connect, recording_id=config.recording_id)
     scene = Scene(sink, config.scene)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_after, args=(parent,), name="view-end", daemon=True).start()
     while True:
         try:
             batch = batches.get(timeout=1.0)
