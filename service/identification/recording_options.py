@@ -1,4 +1,10 @@
-"""Command-line options that describe the columns of a recording, shared by all commands that read one."""
+"""Command-line options that describe the columns of a recording, shared by all commands that read one.
+
+Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
+options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
+text with or without a header line, .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
+(or a folder of a recorder's segments), .feather, .json. Examples: docs/recordings.md.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +24,6 @@ from dehyst.sim.recordings.columns import QUANTITIES, MissingError
 
 T = TypeVar("T")
 
-READING = """\
-Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
-options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
-text with or without a header line, .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
-(or a folder of a recorder's segments), .feather, .json. Examples: docs/recordings.md.
-"""
-
 
 def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False) -> None:
     """Add the options from ``--map`` to ``--decimal`` that say how to read a recording.
@@ -33,7 +32,7 @@ def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False
     """
     quantities = ", ".join(QUANTITIES)
     units = "; ".join(f"{quantity}: {' '.join(factors)}" for quantity, (_, factors) in QUANTITIES.items())
-    group = parser.add_argument_group("what the file's columns mean", READING)
+    group = parser.add_argument_group("what the file's columns mean", (__doc__ or "").partition("\n\n")[2])
     group.add_argument(
         "--map", type=Path, metavar="FILE.toml", help="read these options from a file; the command line overrides it"
     )
