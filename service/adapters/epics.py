@@ -1,16 +1,9 @@
 """``dehyst epics``: one axis of a service as EPICS process variables, over PVAccess, through `p4p`.
 
-| variable | type | |
-|---|---|---|
-| ``PREFIX:STATUS`` | string | ``ok``, ``stale``, ``frozen``, ``no_service``, or the name of the trouble |
-| ``PREFIX:TRUST`` | double | weight of the learning model, 0 to 1 |
-| ``PREFIX:MODEL_ERROR`` | double, % | recent error of the learning model, in percent of the voltage span |
-| ``PREFIX:SAMPLE`` | long | number of the last sample that the service has handled |
-| ``PREFIX:SERVED`` | string | the model that answers where a query names none |
-| ``PREFIX:FREEZE`` | bool, writable | 1 stops learning, 0 lets it go on |
-| ``PREFIX:ENABLE`` | bool, writable | 0 serves the mean gain (``linear``), 1 the model that was served before |
+The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
+PVAccess knows no passwords: everybody who reaches the address may freeze the axis. Needs p4p (pip install p4p).
 
-Variables of an axis whose service does not answer have the alarm INVALID. Sources: documentation of p4p 4.
+  dehyst epics --prefix LAB:STAGE:X
 """
 
 from __future__ import annotations
@@ -19,14 +12,13 @@ import argparse
 import math
 import time
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, Final
 
 import zenoh
 
 from dehyst.adaptive.errors import DehystError
 from dehyst.service.adapters.adapter import load_library
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared, check_number
 from dehyst.service.operating.remote import operate, statuses
 from dehyst.service.protocol.errors import FieldError, ServiceError
 from dehyst.service.protocol.keys import AUTO, Keys
@@ -34,28 +26,31 @@ from dehyst.service.runtime.session import is_loopback, open_client
 from dehyst.service.runtime.stopping import StopSignal
 from dehyst.service.security.authenticator import own_authenticator
 
-EPILOG = """\
-The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
-PVAccess knows no passwords: everybody who reaches the address may freeze the axis. Needs p4p (pip install p4p).
-
-  dehyst epics --prefix LAB:STAGE:X
-"""
 #: The model that ENABLE = 0 serves.
 PLAIN: Final = "linear"
 _OK, _MAJOR, _INVALID = 0, 2, 3
-#: Name, type of p4p, and unit of the variables.
-_READ: Final = (
-    ("STATUS", "s", ""),
-    ("TRUST", "d", ""),
-    ("MODEL_ERROR", "d", "%"),
-    ("SAMPLE", "l", ""),
-    ("SERVED", "s", ""),
-)
-_WRITTEN: Final = ("FREEZE", "ENABLE")
+#: Type of p4p and unit of the variables, and their initial values by type.
+_VARIABLES: Final = {
+    "STATUS": ("s", ""), "TRUST": ("d", ""), "MODEL_ERROR": ("d", "%"), "SAMPLE": ("l", ""), "SERVED": ("s", ""),
+    "FREEZE": ("?", ""), "ENABLE": ("?", ""),
+}  # fmt: skip
+_INITIAL: Final[dict[str, Any]] = {"s": "", "d": math.nan, "l": -1, "?": False}
 
 
 class EpicsAxis:
     """The process variables of one axis. Use as a context manager, and call :meth:`poll` once a period.
+
+    | variable | type | |
+    |---|---|---|
+    | ``PREFIX:STATUS`` | string | ``ok``, ``stale``, ``frozen``, ``no_service``, or the name of the trouble |
+    | ``PREFIX:TRUST`` | double | weight of the learning model, 0 to 1 |
+    | ``PREFIX:MODEL_ERROR`` | double, % | recent error of the learning model, in percent of the voltage span |
+    | ``PREFIX:SAMPLE`` | long | number of the last sample that the service has handled |
+    | ``PREFIX:SERVED`` | string | the model that answers where a query names none |
+    | ``PREFIX:FREEZE`` | bool, writable | 1 stops learning, 0 lets it go on |
+    | ``PREFIX:ENABLE`` | bool, writable | 0 serves the mean gain (``linear``), 1 the model that was served before |
+
+    Variables of an axis whose service does not answer have the alarm INVALID. Sources: documentation of p4p 4.
 
     Parameters
     ----------
@@ -77,14 +72,14 @@ class EpicsAxis:
         self._variables: dict[str, Any] = {}
         #: The model that ENABLE = 1 serves.
         self._enabled_model = AUTO
-        for name, kind, unit in _READ:
-            self._variables[name] = _variable(threads, scalars, kind, unit)
-        for name, command in zip(_WRITTEN, (self._freeze, self._enable), strict=True):
-            self._variables[name] = _variable(threads, scalars, "?", "")
-            self._variables[name].put(_handler(command))
         provider = server.StaticProvider("dehyst")
-        for name, variable in self._variables.items():
+        for name, (kind, unit) in _VARIABLES.items():
+            initial = {"value": _INITIAL[kind]} | ({"display.units": unit} if unit else {})
+            variable = threads.SharedPV(nt=scalars.NTScalar(kind, display=kind in "dl"), initial=initial)
+            self._variables[name] = variable
             provider.add(f"{prefix}:{name}", variable)
+        for name, command in (("FREEZE", self._freeze), ("ENABLE", self._enable)):
+            self._variables[name].put(_handler(command))
         local = {
             "EPICS_PVAS_INTF_ADDR_LIST": interface, "EPICS_PVAS_SERVER_PORT": str(port),
             "EPICS_PVAS_BROADCAST_PORT": str(port + 1 if port else 0),
@@ -108,9 +103,9 @@ class EpicsAxis:
         try:
             status = self._status()
         except ServiceError as error:
-            for name in (*(name for name, *_ in _READ), *_WRITTEN):
-                self._post(name, None, _INVALID, str(error))
-            self._post("STATUS", "no_service", _INVALID, str(error))
+            for name, variable in self._variables.items():
+                shown = "no_service" if name == "STATUS" else variable.current().raw.value
+                self._post(name, shown, _INVALID, str(error))
             return "no_service"
         shown = str(status["trouble"] or ("frozen" if status["frozen"] else "stale" if status["stale"] else "ok"))
         severity = _OK if shown in ("ok", "frozen") else _MAJOR
@@ -138,11 +133,7 @@ class EpicsAxis:
         raise ServiceError(f"{self._keys.base}: no reply within {self._timeout_s:g} s; is the service running?")
 
     def _post(self, name: str, value: Any, severity: int, message: str) -> None:
-        variable = self._variables[name]
-        if value is None:
-            value = variable.current().raw.value
-        stamp_unix_s = time.time()
-        variable.post(value, timestamp=stamp_unix_s, severity=severity, message=message[:80])
+        self._variables[name].post(value, timestamp=time.time(), severity=severity, message=message[:80])
 
     def _freeze(self, on: bool) -> None:
         operate(self._session, self._keys, "freeze" if on else "thaw", "epics", None, self._timeout_s, self._by)
@@ -152,13 +143,6 @@ class EpicsAxis:
         model = self._enabled_model if on else PLAIN
         operate(self._session, self._keys, "select", "epics", {"model": model}, self._timeout_s, self._by)
         self.poll()
-
-
-def _variable(threads: ModuleType, scalars: ModuleType, kind: str, unit: str) -> Any:
-    scalar = scalars.NTScalar(kind, display=kind in "dl")
-    initial: Any = {"s": "", "d": math.nan, "l": -1, "?": False}[kind]
-    variable = threads.SharedPV(nt=scalar, initial={"value": initial, **({"display.units": unit} if unit else {})})
-    return variable
 
 
 def _handler(command: Callable[[bool], None]) -> Callable[[Any, Any], None]:
@@ -175,32 +159,21 @@ def _handler(command: Callable[[bool], None]) -> Callable[[Any, Any], None]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst epics``."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--prefix", required=True, metavar="NAME", help="of the variables' names, such as LAB:STAGE:X")
     add_shared(parser, "stage", "axis")
     add_connection(parser, wait_s=10.0, timeout_s=2.0)
     add("--interface", default="127.0.0.1", metavar="ADDRESS", help="address where PVAccess listens (%(default)s)")
-    add(
-        "--port",
-        type=int,
-        default=5075,
-        metavar="N",
-        help="its TCP port; names are searched at the next one (%(default)s)",
-    )
-    add(
-        "--every", type=float, default=1.0, metavar="S", help="time between two readings of the status, s (%(default)s)"
-    )
+    add("--port", type=int, default=5075, metavar="N", help="its TCP port; names are searched at the next one (5075)")
+    add("--every", type=float, default=1.0, metavar="S", help="time between two readings of the status, s (1.0)")
     add_shared(parser, "insecure-beyond-loopback", "duration")
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the variables until Ctrl-C or SIGTERM. Returns 0."""
     stop = StopSignal()
-    if not (math.isfinite(args.every) and args.every > 0.0):
-        raise FieldError("--every", args.every, "a positive time in s")
-    if not 1 <= args.port <= 65534:
-        raise FieldError("--port", args.port, "1 to 65534")
+    check_number("--every", args.every, "s", low=0, above=True)
+    check_number("--port", args.port, low=1, high=65_534)
     if not args.insecure_beyond_loopback and not is_loopback(f"tcp/{args.interface}:{args.port}"):
         raise FieldError(
             "--interface", repr(args.interface), "an address of this machine, such as 127.0.0.1",
@@ -213,9 +186,6 @@ def run(args: argparse.Namespace) -> int:
     ):
         shown = axis.poll()
         print(f"ready: {args.prefix}:STATUS {shown} at {args.interface}, port {args.port}", flush=True)
-        until = math.inf if args.duration is None else time.monotonic() + args.duration
-        while not stop.reason and time.monotonic() < until:
-            stop.wait(min(args.every, max(0.0, until - time.monotonic())))
-            if not stop.reason:
-                axis.poll()
+        for _ in stop.every(args.every, args.duration):
+            axis.poll()
     return 0

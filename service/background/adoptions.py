@@ -7,13 +7,16 @@ gives the same snapshots bit by bit, however long the background work took.
 from __future__ import annotations
 
 import json
-import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+import numpy as np
+
+from dehyst.adaptive.errors import DehystError
+from dehyst.adaptive.state import Entry, load
 from dehyst.adaptive.types import Hyperparameters, OnlineModel
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.storage.output import append_line
@@ -28,9 +31,13 @@ class Retuned:
     ``seq`` continues when a stage restarts its count, as the number in the learner does.
     """
 
-    seq: int
-    gamma: float
-    widths: tuple[float, ...]
+    seq: Annotated[int, Entry("number of the sample")]
+    gamma: Annotated[float, Entry("weight of the errors", low=5e-324)]
+    widths: Annotated[tuple[float, ...], Entry("widths of the kernel", low=5e-324)]
+
+    def __post_init__(self) -> None:
+        if not self.widths:
+            raise ValueError("widths: got none, expected one or more")
 
     @property
     def hyper(self) -> Hyperparameters:
@@ -43,17 +50,11 @@ class Retuned:
     @classmethod
     def from_json(cls, values: Any, where: str = "retuned") -> Retuned:
         """Inverse of :meth:`to_json`. Raises InputError naming the field."""
-        if not isinstance(values, dict):
-            raise FieldError(where, repr(values)[:80], "an object with seq, gamma and widths")
-        seq, gamma, widths = (values.get(name) for name in ("seq", "gamma", "widths"))
-        if not isinstance(seq, int) or isinstance(seq, bool):
-            raise FieldError(f"{where}.seq", repr(seq), "an integer")
-        if not isinstance(widths, list) or not widths:
-            raise FieldError(f"{where}.widths", repr(widths)[:80], "a list of one or more numbers")
-        for name, value in (("gamma", gamma), *((f"widths[{i}]", width) for i, width in enumerate(widths))):
-            if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < math.inf:
-                raise FieldError(f"{where}.{name}", repr(value)[:80], "a positive number")
-        return cls(seq, float(gamma), tuple(float(width) for width in widths))  # type: ignore[arg-type]
+        try:
+            return load(cls, {**values, "widths": np.array(values["widths"], dtype=np.float64)})
+        except (KeyError, TypeError, ValueError, DehystError) as error:
+            expected = "an object with seq, gamma and widths: an integer, and positive numbers"
+            raise FieldError(where, f"{str(values)[:80]} ({str(error).partition(';')[0]})", expected) from error
 
 
 class Adoptions:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from dehyst.adaptive.types import Hyperparameters, OnlineModel, WindowData
+from dehyst.adaptive.types import FloatArray, OnlineModel, WindowData
 from dehyst.service.background.adoptions import Retuned, append_adoption
 from dehyst.service.background.job import BackgroundJob
 from dehyst.service.background.retuning_worker import pack, start_job
@@ -47,19 +48,16 @@ class Retuner:
         self._asked = False
         self._number = 0
         self._job: BackgroundJob | None = None
+        #: The learner that is re-tuned, and the steps of that.
         self._learner: OnlineModel | None = None
-        self._before: WindowData | None = None
+        self._steps: Iterator[None] = iter(())
         self._proposed: dict[str, Any] = {}
-        self._since_s, self._taught = math.nan, 0
-        self._known: set[bytes] = set()
-        self._fresh: list[bytes] = []
-        # Trials of this proposal so far; each needs twice the samples of the previous one.
-        self._looks = 0
+        self._now_s = self._since_s = math.nan
+        self._taught = 0
         self._look_s = -math.inf
         self._last: dict[str, Any] | None = None
-        self._counts = dict.fromkeys(
-            ("requests", "started", "proposed", "unchanged", "better", "worse", "timeouts", "failed", "dropped"), 0
-        )
+        counts = ("requests", "started", "proposed", "unchanged", "better", "worse", "timeouts", "failed", "dropped")
+        self._counts = dict.fromkeys(counts, 0)
 
     def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Request a re-tuning, which begins with the next samples. Raises InputError on any argument."""
@@ -81,39 +79,40 @@ class Retuner:
         learner = axis.learner
         if learner is None or not axis.learning or learner.seq < 0:
             return
-        now_s = learner.seq * axis.dt_s
+        self._now_s = learner.seq * axis.dt_s
         if self._state == IDLE:
-            self._begin(axis, learner, now_s)
+            self._begin(axis, learner)
+        if self._state == IDLE:
             return
         if learner is not self._learner or axis.frozen:
-            self._end(now_s, "dropped", "the learner was frozen or exchanged meanwhile")
-        elif self._state == WAITING:
-            self._try(axis, learner, now_s)
-        elif self._job is not None and self._job.result is not None:
-            result, self._job = self._job.result, None
-            if "error" in result:
-                self._end(now_s, "timeouts" if result.get("timeout") else "failed", str(result["error"]))
-            elif self._state == PROPOSING:
-                self._take_proposal(result, now_s)
-            else:
-                self._take_trial(axis, learner, result, now_s)
+            self._end("dropped", "the learner was frozen or exchanged meanwhile")
+        else:
+            try:
+                next(self._steps)
+            except StopIteration as ended:
+                self._end(*ended.value)
 
     def leave(self) -> None:
         """Release the learner: the axis becomes a standby. A running re-tuning is dropped when it serves again."""
-        self._learner = self._before = None
+        self._learner, self._steps = None, iter(())
 
     def close(self) -> None:
         """End a running process."""
         if self._job is not None:
             self._job.cancel()
 
-    def _begin(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
-        due = self.config.period_s > 0.0 and now_s - self._since_s >= self.config.period_s
-        if math.isnan(self._since_s) or now_s < self._since_s:
-            self._since_s, self._taught = now_s, _taught(learner)
-        if not (self._asked or due) or axis.frozen or 0.0 <= now_s - self._look_s < _LOOK_S:
+    def _looks(self) -> bool:
+        """Whether the window may be read again."""
+        looks = not 0.0 <= self._now_s - self._look_s < _LOOK_S
+        self._look_s = self._now_s if looks else self._look_s
+        return looks
+
+    def _begin(self, axis: Axis, learner: OnlineModel) -> None:
+        due = self.config.period_s > 0.0 and self._now_s - self._since_s >= self.config.period_s
+        if math.isnan(self._since_s) or self._now_s < self._since_s:
+            self._since_s, self._taught = self._now_s, _taught(learner)
+        if not (self._asked or due) or axis.frozen or not self._looks():
             return
-        self._look_s = now_s
         # A stage at rest has given no new samples to tune on or to try a proposal on.
         if not self._asked and _taught(learner) - self._taught < self.config.fresh:
             return
@@ -124,74 +123,64 @@ class Retuner:
             self._asked, self._state = False, PROPOSING
             self._number += 1
         self._counts["started"] += 1
-        self._learner, self._before = learner, data
-        self._known = set(_rows(data, np.arange(data.age.size)))
-        self._fresh, self._looks = [], 0
-        order = {"kind": "propose", "search": asdict(self.config.search)}
-        self._job = start_job(order, pack("before", data), self.config.timeout_s)
+        self._learner, self._steps = learner, self._retune(axis, learner, data)
 
-    def _take_proposal(self, result: dict[str, Any], now_s: float) -> None:
-        self._proposed = result
+    def _retune(self, axis: Axis, learner: OnlineModel, before: WindowData) -> Generator[None, None, tuple[Any, ...]]:
+        """The steps of one re-tuning. Returns the arguments of `_end`."""
+        config, search = self.config, asdict(self.config.search)
+        proposal = yield from self._worked({"kind": "propose", "search": search}, pack("before", before))
+        if "error" in proposal:
+            return _failure(proposal)
+        self._proposed = proposal
         self._counts["proposed"] += 1
-        if result["changed"]:
-            self._state, self._since_s = WAITING, now_s
-        else:
-            self._end(now_s, "unchanged", "nothing better was found")
+        if not proposal["changed"]:
+            return "unchanged", "nothing better was found"
+        known, fresh = set(_rows(before, np.arange(before.age.size))), list[bytes]()
+        since_s, told, trial = self._now_s, "", {}
+        # Each trial needs twice the samples of the one before.
+        for look in range(config.search.looks):
+            self._state = WAITING
+            while len(fresh) < config.fresh << look:
+                if self._now_s - since_s > config.wait_s:
+                    return "dropped", "too few fresh samples came to try it on"
+                yield
+                if self._looks():
+                    _collect(learner, known, fresh)
+            self._state = TRYING
+            columns = np.frombuffer(b"".join(fresh)).reshape(len(fresh), -1)
+            after = WindowData(columns[:, :-1], columns[:, -1], np.arange(len(fresh), 0, -1.0) - 1.0, before.hyper)
+            order = {"kind": "compare", "search": search, "gamma": proposal["gamma"], "widths": proposal["widths"]}
+            trial = yield from self._worked(order, pack("before", before) | pack("after", after))
+            if "error" in trial:
+                return _failure(trial)
+            told = (
+                f"{1e3 * trial['after_V']:.3g} mV rms on {trial['fresh']} fresh samples, "
+                f"{1e3 * trial['before_V']:.3g} mV as it is"
+            )
+            if trial["better"]:
+                return "better", told, {**trial, "retuned": self._adopt(axis, learner, told)}
+            if not trial["open"]:
+                break
+        return "worse", told, trial
 
-    def _try(self, axis: Axis, learner: OnlineModel, now_s: float) -> None:
-        if 0.0 <= now_s - self._look_s < _LOOK_S:
-            return
-        self._look_s = now_s
-        before = self._before
-        assert before is not None
-        data = learner.window_data()
-        assert data is not None, "it was not None when the proposal was asked for"
-        self._collect(data)
-        if len(self._fresh) < self.config.fresh << self._looks:
-            if now_s - self._since_s > self.config.wait_s:
-                self._end(now_s, "dropped", "too few fresh samples came to try it on")
-            return
-        order = {
-            "kind": "compare",
-            "search": asdict(self.config.search),
-            "gamma": self._proposed["gamma"],
-            "widths": self._proposed["widths"],
-        }
-        self._state = TRYING
-        columns = np.frombuffer(b"".join(self._fresh)).reshape(len(self._fresh), -1)
-        kernel, targets_V = columns[:, :-1], columns[:, -1]
-        after = WindowData(kernel, targets_V, np.arange(len(columns), 0, -1.0) - 1.0, before.hyper)
-        self._job = start_job(order, pack("before", before) | pack("after", after), self.config.timeout_s)
+    def _worked(self, order: dict[str, Any], arrays: dict[str, FloatArray]) -> Generator[None, None, dict[str, Any]]:
+        """The result of a process; waits for it from step to step."""
+        self._job = start_job(order, arrays, self.config.timeout_s)
+        while self._job.result is None:
+            yield
+        result, self._job = self._job.result, None
+        return result
 
-    def _collect(self, data: WindowData) -> None:
-        """Keep the samples that are new in the window: in periodic motion one fresh sample replaces another."""
-        newest = np.flatnonzero(data.age < _NEWEST)
-        for row in _rows(data, newest[np.argsort(-data.age[newest], kind="stable")]):
-            if row not in self._known:
-                self._known.add(row)
-                self._fresh.append(row)
-
-    def _take_trial(self, axis: Axis, learner: OnlineModel, result: dict[str, Any], now_s: float) -> None:
-        told = (
-            f"{1e3 * result['after_V']:.3g} mV rms on {result['fresh']} fresh samples, "
-            f"{1e3 * result['before_V']:.3g} mV as it is"
-        )
-        if not result["better"]:
-            self._looks += 1
-            if result["open"] and self._looks < self.config.search.looks:
-                self._state = WAITING
-            else:
-                self._end(now_s, "worse", told, result)
-            return
+    def _adopt(self, axis: Axis, learner: OnlineModel, told: str) -> dict[str, Any]:
+        """Announce and store the adoption of the proposal; returns it as JSON."""
         seq = learner.seq + max(1, round(self.config.lead_s / axis.dt_s))
-        hyper = Hyperparameters(float(self._proposed["gamma"]), tuple(float(w) for w in self._proposed["widths"]))
-        retuned = Retuned(seq, hyper.gamma, hyper.widths)
+        retuned = Retuned(seq, float(self._proposed["gamma"]), tuple(float(w) for w in self._proposed["widths"]))
         axis.adopt_at(retuned)
         axis.note("retuning_adopted", f"{told}; adopted after sample {seq}", retuned=retuned.to_json())
         if self._folder is not None:
             # A slow disk must not delay the thread that learns.
             threading.Thread(target=self._write, args=(self._folder, retuned), name="retuned", daemon=True).start()
-        self._end(now_s, "better", told, {**result, "retuned": retuned.to_json()})
+        return retuned.to_json()
 
     def _write(self, folder: Path, retuned: Retuned) -> None:
         try:
@@ -199,19 +188,33 @@ class Retuner:
         except OSError as error:
             self._last = {**(self._last or {}), "not_written": str(error)}
 
-    def _end(self, now_s: float, count: str, why: str, more: dict[str, Any] | None = None) -> None:
+    def _end(self, count: str, why: str, more: dict[str, Any] | None = None) -> None:
         if self._job is not None:
             job, self._job = self._job, None
             threading.Thread(target=job.cancel, name="retune-end", daemon=True).start()
         self._counts[count] += 1
         proposal = {key: self._proposed.get(key) for key in ("gamma", "widths", "J2", "J2_before")}
         self._last = {"job": self._number, "outcome": count, "detail": why, **proposal, **(more or {})}
-        self._proposed, self._before, self._learner = {}, None, None
-        self._known, self._fresh = set(), []
+        self._proposed, self._learner, self._steps = {}, None, iter(())
         # The period until the next re-tuning starts now.
         self._since_s = math.nan
         with self._lock:
             self._state = IDLE
+
+
+def _failure(result: dict[str, Any]) -> tuple[str, str]:
+    return "timeouts" if result.get("timeout") else "failed", str(result["error"])
+
+
+def _collect(learner: OnlineModel, known: set[bytes], fresh: list[bytes]) -> None:
+    """Keep the samples that are new in the window: in periodic motion one fresh sample replaces another."""
+    data = learner.window_data()
+    assert data is not None, "it was not None when the proposal was asked for"
+    newest = np.flatnonzero(data.age < _NEWEST)
+    for row in _rows(data, newest[np.argsort(-data.age[newest], kind="stable")]):
+        if row not in known:
+            known.add(row)
+            fresh.append(row)
 
 
 def _taught(learner: OnlineModel) -> int:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, Final
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.tuning.config import RetuneConfig
+from dehyst.service.config.schema import Setting
+
+#: Time of the samples that a diagnosis takes.
+RECENT: Final = Setting(unit="s", low=1.5, high=3600.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,36 +35,20 @@ class WatchConfig:
     """
 
     enabled: bool = True
-    history_s: float = 40.0
-    reference_s: float = 20.0
-    recent_s: float = 10.0
-    collect_s: float = 6.0
-    gain_alarm: float = 0.01
-    offset_alarm: float = 0.02
-    error_factor: float = 4.0
-    error_floor_pct: float = 0.5
-    hold_s: float = 0.5
-    cooldown_s: float = 30.0
-    timeout_s: float = 120.0
+    history_s: Annotated[float, Setting(unit="s", low=2.0, high=3600.0)] = 40.0
+    reference_s: Annotated[float, Setting(unit="s", low=2.0, high=3600.0)] = 20.0
+    recent_s: Annotated[float, RECENT] = 10.0
+    collect_s: Annotated[float, RECENT] = 6.0
+    gain_alarm: Annotated[float, Setting(low=1e-4, high=1.0)] = 0.01
+    offset_alarm: Annotated[float, Setting(low=1e-4, high=1.0)] = 0.02
+    error_factor: Annotated[float, Setting(low=1.1, high=1e6)] = 4.0
+    error_floor_pct: Annotated[float, Setting(low=0.0, high=100.0)] = 0.5
+    hold_s: Annotated[float, Setting(unit="s", low=0.0, high=600.0)] = 0.5
+    cooldown_s: Annotated[float, Setting(unit="s", low=0.0, high=1e6)] = 30.0
+    timeout_s: Annotated[float, Setting(unit="s", low=1.0, high=3600.0)] = 120.0
     reports: str = ""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("history_s", 2.0, 3600.0),
-            ("reference_s", 2.0, 3600.0),
-            ("recent_s", 1.5, 3600.0),
-            ("collect_s", 1.5, 3600.0),
-            ("gain_alarm", 1e-4, 1.0),
-            ("offset_alarm", 1e-4, 1.0),
-            ("error_factor", 1.1, 1e6),
-            ("error_floor_pct", 0.0, 100.0),
-            ("hold_s", 0.0, 600.0),
-            ("cooldown_s", 0.0, 1e6),
-            ("timeout_s", 1.0, 3600.0),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(f"{name}: got {value!r}, expected {low:g} to {high:g}")
         longest = max(self.reference_s, self.recent_s, self.collect_s)
         if self.history_s < longest:
             raise InputError(
@@ -84,18 +73,9 @@ class RetuningConfig:
     """
 
     enabled: bool = True
-    period_s: float = 60.0
-    fresh: int = 200
-    wait_s: float = 120.0
-    lead_s: float = 0.5
-    timeout_s: float = 60.0
+    period_s: Annotated[float, Setting(unit="s", low=0.0)] = 60.0
+    fresh: Annotated[int, Setting(low=20)] = 200
+    wait_s: Annotated[float, Setting(unit="s", low=0.0, above=True)] = 120.0
+    lead_s: Annotated[float, Setting(unit="s", low=0.0, high=60.0)] = 0.5
+    timeout_s: Annotated[float, Setting(unit="s", low=0.0, above=True)] = 60.0
     search: RetuneConfig = field(default_factory=RetuneConfig)
-
-    def __post_init__(self) -> None:
-        if not (self.period_s >= 0.0 and 0.0 <= self.lead_s <= 60.0):
-            raise InputError(f"period_s, lead_s: got {self.period_s}, {self.lead_s}, expected >= 0 s, and 0 to 60 s")
-        if not (self.fresh >= 20 and self.wait_s > 0.0 and self.timeout_s > 0.0):
-            raise InputError(
-                f"fresh, wait_s, timeout_s: got {self.fresh}, {self.wait_s}, {self.timeout_s}, "
-                "expected at least 20 samples, and positive times"
-            )

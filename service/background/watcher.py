@@ -10,15 +10,14 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from dehyst.adaptive.inverse_model import LssvmInverse
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.background.job import BackgroundJob
-from dehyst.service.background.settings import WatchConfig
+from dehyst.service.background.settings import RECENT, WatchConfig
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
@@ -55,39 +54,26 @@ class SampleBuffer:
     def add(self, batch: SampleBatch) -> bool:
         """Append the samples newer than all earlier ones. Returns False if the stage has restarted its count."""
         new = batch.seq > self._last
-        going_on = True
-        if not new.all():
-            # Skip duplicates and late samples; a long run of them means a restarted stage.
-            self._old = self._old + int(batch.seq.size - new.sum()) if not new.any() else 0
-            if self._old >= _RESTART_AFTER:
-                self.clear()
-                new = np.ones_like(new)
-                going_on = False
-            elif not new.any():
-                return True
-        else:
-            self._old = 0
-        block = np.stack([batch.seq, batch.t_s, batch.u_V, batch.y_um])[:, new]
-        n, room = block.shape[1], self._rows.shape[1]
-        block = block[:, -room:]
-        where = (self._end + np.arange(block.shape[1])) % room
-        with self._lock:
-            self._rows[:, where] = block
-            self._end = int((self._end + block.shape[1]) % room)
-            self._kept = min(room, self._kept + n)
-            self._last = int(batch.seq[new][-1])
-        return going_on
-
-    def clear(self) -> None:
-        """Remove all samples."""
-        with self._lock:
+        # Skip duplicates and late samples; a long run of them means a restarted stage.
+        self._old = 0 if new.any() else self._old + len(batch)
+        restarted = self._old >= _RESTART_AFTER
+        if restarted:
             self._end = self._kept = self._old = 0
-            self._last = -1
+            new[:] = True
+        if new.any():
+            block = np.stack([batch.seq, batch.t_s, batch.u_V, batch.y_um])[:, new][:, -self._rows.shape[1] :]
+            n, room = block.shape[1], self._rows.shape[1]
+            with self._lock:
+                self._rows[:, (self._end + np.arange(n)) % room] = block
+                self._end = (self._end + n) % room
+                self._kept = min(room, self._kept + n)
+                self._last = int(block[0, -1])
+        return not restarted
 
-    def copy(self, samples: int | None = None) -> FloatArray:
+    def copy(self, samples: int = MOST_SAMPLES) -> FloatArray:
         """The newest ``samples`` (all by default) as (4, n): seq, t_s, u_V, y_um; oldest first."""
         with self._lock:
-            n = self._kept if samples is None else min(samples, self._kept)
+            n = min(samples, self._kept)
             where = (self._end - n + np.arange(n)) % self._rows.shape[1]
             return np.asarray(self._rows[:, where])
 
@@ -95,8 +81,7 @@ class SampleBuffer:
 # --- The alarm of the diagnosis: compares the figures of the learner with those of a reference period.
 
 
-@dataclass(frozen=True, slots=True)
-class Levels:
+class Levels(NamedTuple):
     """Figures of a learner: gain of the stage, offset in V, recent rms error in % of the voltage span, validity."""
 
     gain: float
@@ -108,15 +93,13 @@ class Levels:
     def of(diagnostics: Mapping[str, Any]) -> Levels | None:
         """From the diagnostics of a learner; None if they lack a figure or one is not finite."""
         try:
-            levels = Levels(
-                float(diagnostics["gain"]),
-                float(diagnostics["offset_V"]),
-                float(diagnostics["recent_rms_error_pct"]),
-                bool(diagnostics.get("valid", 1.0)),
+            gain, offset_V, error_pct = (
+                float(diagnostics[key]) for key in ("gain", "offset_V", "recent_rms_error_pct")
             )
         except (KeyError, TypeError, ValueError):
             return None
-        return levels if all(math.isfinite(v) for v in (levels.gain, levels.offset_V, levels.error_pct)) else None
+        known = all(map(math.isfinite, (gain, offset_V, error_pct)))
+        return Levels(gain, offset_V, error_pct, bool(diagnostics.get("valid", 1.0))) if known else None
 
 
 class Alarm:
@@ -126,7 +109,7 @@ class Alarm:
         self._config = config
         self._span_V = max(abs(span_V), 1e-12)
         self._normal: Levels | None = None
-        self._since_s: float | None = None
+        self._since_s = math.inf
 
     @property
     def armed(self) -> bool:
@@ -135,33 +118,25 @@ class Alarm:
 
     def arm(self, levels: Levels | None) -> None:
         """Take ``levels`` as the reference; None disarms."""
-        self._normal, self._since_s = levels, None
+        self._normal, self._since_s = levels, math.inf
 
     def check(self, t_s: float, now: Levels) -> str:
         """The reason for an alarm at ``t_s``; "" for no alarm."""
-        if self._normal is None:
-            return ""
-        why = self._out_of_bounds(now, self._normal)
-        if not why:
-            self._since_s = None
-            return ""
-        if self._since_s is None or t_s < self._since_s:
-            self._since_s = t_s
+        why = "" if self._normal is None else self._out_of_bounds(now, self._normal)
+        self._since_s = min(self._since_s, t_s) if why else math.inf
         return why if t_s - self._since_s >= self._config.hold_s else ""
 
     def _out_of_bounds(self, now: Levels, normal: Levels) -> str:
         c = self._config
         gain = now.gain / normal.gain - 1.0 if normal.gain else 0.0
+        offset = (now.offset_V - normal.offset_V) / self._span_V
         if abs(gain) > c.gain_alarm:
             return f"the learner's gain moved by {100.0 * gain:+.1f} %"
-        offset = (now.offset_V - normal.offset_V) / self._span_V
         if abs(offset) > c.offset_alarm:
             return f"the learner's offset moved by {100.0 * offset:+.1f} % of the span"
         if now.error_pct > max(c.error_factor * normal.error_pct, c.error_floor_pct):
             return f"the learner's error grew from {normal.error_pct:.2g} to {now.error_pct:.2g} % of the span"
-        if normal.valid and not now.valid:
-            return "the learner lost its validity"
-        return ""
+        return "the learner lost its validity" if normal.valid and not now.valid else ""
 
 
 # --- The watch over an axis.
@@ -223,9 +198,7 @@ class Watcher:
     def tick(self, now_s: float) -> None:
         """Start a diagnosis if one is due. Call it from the publishing thread, with a monotonic time."""
         seq = self._alarm_seq
-        if seq is None or self._buffer.last_seq < self._due_seq:
-            return
-        if self._job is not None and self._job.running:
+        if seq is None or self._buffer.last_seq < self._due_seq or self._busy:
             return
         self._alarm_seq = None
         self._start("alarm", self._alarm_why, seq, now_s, "")
@@ -241,8 +214,8 @@ class Watcher:
             if key not in _ARGUMENTS:
                 raise FieldError(key, repr(arguments[key])[:80], f"some of {', '.join(_ARGUMENTS)}")
         recent_s, report = arguments.get("recent_s", self.config.recent_s), arguments.get("report", False)
-        if isinstance(recent_s, bool) or not isinstance(recent_s, int | float) or not 1.5 <= recent_s <= 3600.0:
-            raise FieldError("recent_s", repr(recent_s), "1.5 to 3600 s")
+        if isinstance(recent_s, bool) or not isinstance(recent_s, int | float) or not RECENT.holds(recent_s):
+            raise FieldError("recent_s", repr(recent_s), RECENT.range())
         if not isinstance(report, bool):
             raise FieldError("report", repr(report), "true or false")
         if report and not self.config.reports:
@@ -259,21 +232,18 @@ class Watcher:
     def status(self) -> dict[str, Any]:
         """For the status of the axis: counts, whether a diagnosis runs, and the last verdicts, newest first."""
         with self._lock:
-            return {
-                "enabled": True,
-                "running": self._job is not None and self._job.running,
-                "reference": self._reference is not None,
-                "armed": self._alarm.armed,
-                **self._counts,
-                "last": self._last,
-                "history": list(self._history),
-            }
+            known = {"reference": self._reference is not None, "armed": self._alarm.armed, **self._counts}
+            return {"enabled": True, "running": self._busy, **known, "last": self._last, "history": [*self._history]}
 
     def close(self) -> None:
         """End a running diagnosis; it gives no verdict."""
         self._closed = True
         if self._job is not None:
             self._job.cancel()
+
+    @property
+    def _busy(self) -> bool:
+        return self._job is not None and self._job.running
 
     def _samples(self, seconds: float) -> int:
         return max(1, round(seconds / self._dt_s))
@@ -312,12 +282,10 @@ class Watcher:
     def _start(self, cause: str, why: str, from_seq: int, now_s: float, report: str) -> dict[str, Any]:
         reference = self._reference
         with self._lock:
-            busy = self._job is not None and self._job.running
-            if busy or self._closed or reference is None:
+            if self._busy or self._closed or reference is None:
                 self._counts["skipped"] += 1
-                return {"started": False, "why": "one is running" if busy else "the service is ending"}
-            self._counts["started"] += 1
-            number = self._counts["started"]
+                return {"started": False, "why": "one is running" if self._busy else "the service is ending"}
+            self._counts["started"] = number = self._counts["started"] + 1
             recent = self._buffer.copy()
             order = {
                 "model": str(self._axis.config.model.resolve()),

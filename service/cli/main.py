@@ -81,6 +81,8 @@ dehyst COMMAND --help lists the options of a command. Exit status: 0 done, 1 fai
 class Command(NamedTuple):
     """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, its group, one line of help.
 
+    The docstring of the module behind its title is shown below the options: notes, and examples of each use.
+
     ``extras`` : of the installation, without which it cannot do its work. ``compiles`` : whether it needs the compiled
     loops from the start.
     """
@@ -261,9 +263,11 @@ def build_parser(commands: Mapping[str, Command], loaded: Collection[str]) -> ar
 
 
 def _load(entry: Command, parser: argparse.ArgumentParser, commands: Mapping[str, Command]) -> None:
-    from dehyst.service.cli.options import add_shared
+    from dehyst.service.cli.options import add_epilog, add_shared
 
     module = importlib.import_module(entry.module)
+    # What the module says of itself, but for its title, is shown below the options.
+    add_epilog(parser, (module.__doc__ or "").partition("\n\n")[2])
     module.add_arguments(parser)
     add_shared(parser, "log-level")
     parser.set_defaults(run=module.run, commands=commands)

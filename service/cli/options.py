@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from dehyst.service.config.schema import Setting
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
 
@@ -109,8 +110,14 @@ def progress_printer(quiet: bool, first: Callable[[], None] = lambda: None) -> C
     return say
 
 
+def check_number(option: str, value: float | None, unit: str = "", **bounds: Any) -> None:
+    """Raise FieldError where ``value`` is outside ``bounds``: ``low``, ``high`` and ``above`` of `Setting`."""
+    setting = Setting(unit=unit, **bounds)
+    if value is not None and not setting.holds(value):
+        raise FieldError(option, value, setting.range())
+
+
 def check_seed(seed: int) -> int:
     """``seed``. Raises FieldError where it is negative."""
-    if seed < 0:
-        raise FieldError("--seed", seed, "an integer from 0 on")
+    check_number("--seed", seed, low=0)
     return seed

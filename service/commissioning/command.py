@@ -1,19 +1,5 @@
-"""``dehyst commission``: identify a stage on live hardware, through its adapter."""
+"""``dehyst commission``: identify a stage on live hardware, through its adapter.
 
-from __future__ import annotations
-
-import argparse
-import json
-import math
-import sys
-from typing import Any
-
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
-from dehyst.service.cli.python_file import load_object
-from dehyst.service.protocol.errors import FieldError
-from dehyst.service.protocol.keys import check_name
-
-EPILOG = """\
 THE STAGE MOVES over the stated voltages: make sure that nothing is in its way. FILE.py:NAME is a function without
 arguments that opens an adapter (service.adapters.StageAdapter, docs/connect.md); the code in FILE.py is run. Voltages
 never leave --u-min to --u-max and never change faster than --slew. Ctrl-C, an error or a fault ramps the stage back to
@@ -23,10 +9,22 @@ dehyst serve) and report.json. Exit status: 0 the target is met, 1 a fault, or w
   dehyst commission --adapter examples/my_stage.py:open_stage --u-min 0 --u-max 80 --slew 400 --out commissioned
 """
 
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from typing import Any
+
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
+from dehyst.service.cli.python_file import load_object
+from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.keys import check_name
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--adapter", required=True, metavar="FILE.py:NAME", help="what opens the adapter of the stage")
     add("--u-min", type=float, required=True, metavar="V", help="lowest voltage that may be applied, V")
@@ -53,8 +51,7 @@ def run(args: argparse.Namespace) -> int:
     check_name("--stage", args.stage)
     check_name("--axis", args.axis)
     for option, value in (("--target", args.target), ("--duration", args.duration), ("--slew", args.slew)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise FieldError(option, value, "a positive number")
+        check_number(option, value, low=0, above=True)
     if args.gain == 0.0 or math.isinf(args.gain):
         raise FieldError("--gain", args.gain, "µm/V other than 0")
     order = Order(

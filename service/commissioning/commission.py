@@ -97,32 +97,25 @@ def response(piece: Piece, where: slice, dt_s: float) -> tuple[float | None, flo
     return -float(np.polyfit(hz[below], turn, 1)[0]) / (2.0 * math.pi), float(hz[peak]) if mode else None
 
 
-class _Identification:
-    """``dehyst identify`` in a process of its own, so that the stage is read meanwhile."""
-
-    def __init__(self, recording: Path, model: Path, holdout: float, order: Order) -> None:
-        self._process = subprocess.Popen(
-            [
-                sys.executable, "-m", "dehyst.service.cli", "identify", str(recording), "--out", str(model), "--json",
-                "--quiet", "--no-pictures", "--holdout", f"{holdout:.6f}", "--stage", order.stage, "--axis", order.axis,
-            ],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
-
-    def done(self) -> bool:
-        return self._process.poll() is not None
-
-    def summary(self) -> dict[str, Any]:
-        """What it printed. Raises StageFault with its error."""
-        printed, said = self._process.communicate()
-        if self._process.returncode:
-            raise StageFault("failed", f"identification: {said.strip()}")
-        found: dict[str, Any] = json.loads(printed)
-        return found
-
-    def end(self) -> None:
-        self._process.kill()
-        self._process.communicate()
+def _identified(mover: Mover, recording: Path, model: Path, holdout: float, order: Order) -> dict[str, Any]:
+    """What ``dehyst identify`` prints, in a process of its own: the stage is read meanwhile. Raises StageFault."""
+    process = subprocess.Popen(
+        [
+            sys.executable, "-m", "dehyst.service.cli", "identify", str(recording), "--out", str(model), "--json",
+            "--quiet", "--no-pictures", "--holdout", f"{holdout:.6f}", "--stage", order.stage, "--axis", order.axis,
+        ],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        mover.hold(lambda: process.poll() is not None)
+        printed, said = process.communicate()
+    finally:
+        process.kill()
+        process.communicate()
+    if process.returncode:
+        raise StageFault("failed", f"identification: {said.strip()}")
+    found: dict[str, Any] = json.loads(printed)
+    return found
 
 
 def commission(
@@ -206,13 +199,8 @@ def _round(
         path, model = Path(folder) / RECORDING, Path(folder) / MODEL
         recording = _write(mover, first, path)
         begin, last = mover.samples[first][0], int(piece.k[-1])
-        worker = _Identification(path, model, (last - int(piece.k[held])) / (last - begin + 1), order)
-        try:
-            say("identifying; the stage rests meanwhile")
-            mover.hold(worker.done)
-            summary = worker.summary()
-        finally:
-            worker.end()
+        say("identifying; the stage rests meanwhile")
+        summary = _identified(mover, path, model, (last - int(piece.k[held])) / (last - begin + 1), order)
         for made in (path, model):
             made.replace(out / made.name)
     scores = {name: of["heldout"] for name, of in summary["models"].items() if of["heldout"]}

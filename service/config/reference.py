@@ -27,8 +27,6 @@ _HEAD = """\
 # Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s. Paths are relative to it.
 """
 _WIDTH = 36
-#: Nested dataclasses that have a table of their own on the page.
-_OWN_TABLES = (CompetitionConfig, CorrectionConfig, RepetitionConfig, RetuningConfig, WatchConfig)
 _TITLE = """\
 # Configuration of `dehyst serve`
 
@@ -43,9 +41,9 @@ Generated from the schema: `python -m dehyst.service.config.reference > docs/con
 def example() -> str:
     """An example file: the keys without a default, and every other key with its default in a comment."""
     lines = [_HEAD, *_example_of(ServeConfig), "", "[[axis]]", *_example_of(AxisConfig), ""]
-    for key in _flat(AxisConfig):
-        if _is_table(key):
-            lines.append(f"{f'# [axis.{key.name}]':<{_WIDTH}}# {key.setting.help}")
+    described = _described(AxisConfig)
+    tables = (key.name for key in _flat(AxisConfig) if _is_table(key))
+    lines += [f"{f'# [axis.{name}]':<{_WIDTH}}# {described[name]}" for name in tables]
     return "\n".join(lines) + "\n"
 
 
@@ -75,14 +73,14 @@ def page() -> str:
 
 
 def _example_of(kind: type) -> list[str]:
-    lines = []
+    lines, described = [], _described(kind)
     for key in _flat(kind):
         if _is_table(key) or key.name in ("axis", "fleet"):
             continue
         shown = key.required or key.setting.shown
         left = f"{'' if shown else '# '}{key.name} = {_toml(key)}"
         unit = f", {key.setting.unit}" if key.setting.unit else ""
-        lines.append(f"{left:<{_WIDTH - 1}} # {key.setting.help}{unit}")
+        lines.append(f"{left:<{_WIDTH - 1}} # {described[key.name]}{unit}")
     return lines
 
 
@@ -93,9 +91,8 @@ def _rows(kind: type, prefix: str) -> list[str]:
     rows, nested = list[tuple[str, ...]](), list[str]()
     for key in _flat(kind):
         if not _is_table(key):
-            meaning = key.setting.help or described.get(key.name, "")
-            rows.append((f"`{prefix}{key.name}`", _values(key), meaning))
-        elif isinstance(key.type, type) and key.type not in _OWN_TABLES:
+            rows.append((f"`{prefix}{key.name}`", _values(key), described.get(key.name, "")))
+        elif isinstance(key.type, type) and key.type not in dict(tables()).values():
             nested += _rows(key.type, f"{prefix}{key.name}.")
     return [*head, *_lines(rows), *nested, *([] if prefix else [""])]
 
@@ -141,7 +138,7 @@ def _values(key: Key) -> str:
 
 def _described(kind: type) -> dict[str, str]:
     """What the docstring of a dataclass says of its fields, as ``name : text`` or ``name, name : text``."""
-    names = [key.name for key in keys_of(kind)]
+    names = [inner.name for key in keys_of(kind) for inner in (key, *inline_keys(key))]
     text = " ".join((kind.__doc__ or "").split())
     one = "|".join(map(re.escape, names))
     marks = list(re.finditer(rf"(?<!\S)((?:{one})(?:, (?:{one}))*) : ", text))

@@ -1,6 +1,7 @@
 """One schema for a configuration file: a frozen dataclass is the default, the check and the documentation of a table.
 
-A field's annotation gives the type; ``Annotated[float, Setting(...)]`` adds meaning, unit and bounds. `build_settings`
+A field's annotation gives the type, the docstring of its class the meaning (``name : text``), and
+``Annotated[float, Setting(...)]`` unit and bounds. `build_settings`
 reads a table by it, and `service.config.reference` writes the example file and the reference page from it. A key that
 the schema does not have is an error. Errors name the field, what was got, what was expected, and what to do.
 """
@@ -29,7 +30,7 @@ class Setting:
 
     Attributes
     ----------
-    help : meaning, one line. unit : unit of the value, "" for none.
+    unit : unit of the value, "" for none.
     low, high : bounds; ``above`` excludes the lower one. A bounded number must also be finite.
     check : ``check(field, value)`` returns the value or raises InputError; in a list, for each entry.
     example : value that the example file shows where the default is empty.
@@ -39,7 +40,6 @@ class Setting:
     advice : what to do where the key is missing.
     """
 
-    help: str = ""
     unit: str = ""
     low: float = -math.inf
     high: float = math.inf
@@ -143,6 +143,14 @@ def build_settings(kind: type[T], table: Mapping[str, Any], where: str, folder: 
         return kind(**values)
     except InputError as error:
         raise _placed(error, where) from error
+
+
+def check_bounds(settings: Any) -> None:
+    """Raise FieldError where a number of a dataclass of settings is outside its bounds: for its ``__post_init__``."""
+    for key in keys_of(type(settings)):
+        value = getattr(settings, key.field)
+        if isinstance(value, int | float) and not key.setting.holds(value):
+            raise FieldError(key.name, value, key.setting.range())
 
 
 def field_name(where: str, key: str) -> str:

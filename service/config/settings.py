@@ -10,7 +10,7 @@ from dehyst.baselines.competition.config import CompetitionConfig
 from dehyst.service.answers.guard import Limits
 from dehyst.service.background.settings import RetuningConfig, WatchConfig
 from dehyst.service.config.correction import CorrectionConfig, RepetitionConfig
-from dehyst.service.config.limits import limits_setting
+from dehyst.service.config.limits import LIMITS
 from dehyst.service.config.schema import Setting, build_settings, parse_toml, read_text
 from dehyst.service.fleet.settings import FleetSettings
 from dehyst.service.protocol.errors import FieldError
@@ -23,164 +23,109 @@ from dehyst.service.security.access import check_reach
 LEARN = "lssvm_adaptive"
 #: Models that compete with the one that learns, where the model file has them.
 COMPETE = ("linear", "mpi", "bouc_wen")
-_LIMITS = limits_setting(
-    "limits of what the service sends",
-    "lowest displacement of a trajectory; default: 5 % beyond the identified range",
-    "highest displacement of a trajectory; default: the same",
-)
-_LEARNER = Setting(help="settings of the learner, see docs/learner.md")
-_COMPETITION = Setting(help="how models are compared and exchanged, see docs/learner.md")
-_RETUNING = Setting(help="background tuning of hyper-parameters, see docs/learner.md")
-_CORRECTION = Setting(help="correction by fresh readings, see docs/correction.md")
-_REPETITION = Setting(help="correction of motion that repeats, see docs/correction.md")
-_DIAGNOSIS = Setting(help="background diagnosis, see docs/diagnosis.md")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisConfig:
-    """One axis of a service: an ``[[axis]]`` table. ``limits.y_*`` are infinite where the file does not give them."""
+    """One axis of a service: an ``[[axis]]`` table. ``limits.y_*`` are infinite where the file does not give them.
 
-    name: Annotated[str, Setting(help="name of the axis on the wire", check=check_name, example="x", shown=True)]
-    model: Annotated[
-        Path,
-        Setting(
-            help="model file from 'dehyst identify'",
-            example="x.npz",
-            shown=True,
-            advice="make one with 'dehyst identify'",
-        ),
-    ]
-    limits: Annotated[Limits, _LIMITS]
-    served: Annotated[
-        str, Setting(help='model that answers a query that names none; "auto": the best of those that learn')
-    ] = AUTO
-    learn: Annotated[str, Setting(help='model that learns; "" for none')] = LEARN
-    compete: Annotated[
-        tuple[str, ...], Setting(help='models that learn beside it; "auto" serves the best of all; [] for none')
-    ] = COMPETE
-    snapshot_every: Annotated[
-        int, Setting(help="samples between two snapshots, which answer the queries", low=1, high=100_000)
-    ] = 20
-    snapshots_kept: Annotated[int, Setting(help="snapshots that a query can ask for by as_of", low=1, high=4096)] = 256
-    query_points: Annotated[
-        int, Setting(help="most points of one query; a query for more is refused", low=1, high=MAX_COUNT)
-    ] = MAX_COUNT
-    queue_samples: Annotated[
-        int, Setting(help="samples that may wait for the learner; more are counted and dropped", low=1, high=10_000_000)
-    ] = 20_000
-    model_hz: Annotated[
-        float, Setting(help="highest rate at which the model is published", unit="1/s", low=0, above=True, high=1000)
-    ] = 50.0
-    delta_hz: Annotated[
-        float,
-        Setting(help="highest rate at which changes of the model are published; 0: none", unit="1/s", low=0, high=1000),
-    ] = 200.0
-    recorder: Annotated[Path | None, Setting(help="folder for recordings", example="recordings/x")] = None
-    recorder_bytes: Annotated[
-        int,
-        Setting(help="most disk that recordings take; the oldest go first", unit="bytes", low=1_000_000, high=10**15),
-    ] = 2_000_000_000
-    checkpoints: Annotated[
-        Path | None,
-        Setting(
-            help="folder for the learner's state, which a restart continues",
-            example="checkpoints/x",
-        ),
-    ] = None
-    checkpoint_s: Annotated[
-        float, Setting(help="time of samples between two checkpoints", unit="s", low=0.05, high=86400)
-    ] = 7.0
-    checkpoints_kept: Annotated[
-        int, Setting(help="checkpoints kept: the newest, and older ones ever further apart", low=2, high=10_000)
-    ] = 32
-    stand_in: Annotated[
-        str,
-        Setting(help="baseline that answers where the model cannot be trusted; default: the best one", example="mpi"),
-    ] = ""
-    blend_share: Annotated[
-        float,
-        Setting(
-            help="distance outside the learnt domain, in learnt spans, at which the baseline answers alone",
-            low=0,
-            above=True,
-            high=100,
-        ),
-    ] = 0.5
-    stale_s: Annotated[
-        float, Setting(help="age of the newest learnt sample at which answers are flagged; 0: never", unit="s", low=0)
-    ] = 2.0
-    last_good_s: Annotated[
-        float,
-        Setting(
-            help="age at which a model that is not renewed gives way to the baseline",
-            unit="s",
-            low=0,
-            above=True,
-        ),
-    ] = 60.0
-    learner: Annotated[dict[str, Any], _LEARNER] = field(default_factory=dict)
-    diagnosis: Annotated[WatchConfig, _DIAGNOSIS] = field(default_factory=WatchConfig)
-    competition: Annotated[CompetitionConfig, _COMPETITION] = field(default_factory=CompetitionConfig)
-    retuning: Annotated[RetuningConfig, _RETUNING] = field(default_factory=RetuningConfig)
-    correction: Annotated[CorrectionConfig, _CORRECTION] = field(default_factory=CorrectionConfig)
-    repetition: Annotated[RepetitionConfig, _REPETITION] = field(default_factory=RepetitionConfig)
+    Attributes
+    ----------
+    name : name of the axis on the wire.
+    model : model file from 'dehyst identify'.
+    limits : limits of what the service sends.
+    u_min_V : lowest voltage that the service sends.
+    u_max_V : highest voltage that the service sends.
+    slew_V_per_s : fastest change of the voltage.
+    y_min_um : lowest displacement of a trajectory; default: 5 % beyond the identified range.
+    y_max_um : highest displacement of a trajectory; default: the same.
+    served : model that answers a query that names none; "auto": the best of those that learn.
+    learn : model that learns; "" for none.
+    compete : models that learn beside it; "auto" serves the best of all; [] for none.
+    snapshot_every : samples between two snapshots, which answer the queries.
+    snapshots_kept : snapshots that a query can ask for by as_of.
+    query_points : most points of one query; a query for more is refused.
+    queue_samples : samples that may wait for the learner; more are counted and dropped.
+    model_hz : highest rate at which the model is published.
+    delta_hz : highest rate at which changes of the model are published; 0: none.
+    recorder : folder for recordings.
+    recorder_bytes : most disk that recordings take; the oldest go first.
+    checkpoints : folder for the learner's state, which a restart continues.
+    checkpoint_s : time of samples between two checkpoints.
+    checkpoints_kept : checkpoints kept: the newest, and older ones ever further apart.
+    stand_in : baseline that answers where the model cannot be trusted; default: the best one.
+    blend_share : distance outside the learnt domain, in learnt spans, at which the baseline answers alone.
+    stale_s : age of the newest learnt sample at which answers are flagged; 0: never.
+    last_good_s : age at which a model that is not renewed gives way to the baseline.
+    learner : settings of the learner, see docs/learner.md.
+    diagnosis : background diagnosis, see docs/diagnosis.md.
+    competition : how models are compared and exchanged, see docs/learner.md.
+    retuning : background tuning of hyper-parameters, see docs/learner.md.
+    correction : correction by fresh readings, see docs/correction.md.
+    repetition : correction of motion that repeats, see docs/correction.md.
+    """
+
+    name: Annotated[str, Setting(check=check_name, example="x", shown=True)]
+    model: Annotated[Path, Setting(example="x.npz", shown=True, advice="make one with 'dehyst identify'")]
+    limits: Annotated[Limits, LIMITS]
+    served: str = AUTO
+    learn: str = LEARN
+    compete: tuple[str, ...] = COMPETE
+    snapshot_every: Annotated[int, Setting(low=1, high=100_000)] = 20
+    snapshots_kept: Annotated[int, Setting(low=1, high=4096)] = 256
+    query_points: Annotated[int, Setting(low=1, high=MAX_COUNT)] = MAX_COUNT
+    queue_samples: Annotated[int, Setting(low=1, high=10_000_000)] = 20_000
+    model_hz: Annotated[float, Setting(unit="1/s", low=0, above=True, high=1000)] = 50.0
+    delta_hz: Annotated[float, Setting(unit="1/s", low=0, high=1000)] = 200.0
+    recorder: Annotated[Path | None, Setting(example="recordings/x")] = None
+    recorder_bytes: Annotated[int, Setting(unit="bytes", low=1_000_000, high=10**15)] = 2_000_000_000
+    checkpoints: Annotated[Path | None, Setting(example="checkpoints/x")] = None
+    checkpoint_s: Annotated[float, Setting(unit="s", low=0.05, high=86_400)] = 7.0
+    checkpoints_kept: Annotated[int, Setting(low=2, high=10_000)] = 32
+    stand_in: Annotated[str, Setting(example="mpi")] = ""
+    blend_share: Annotated[float, Setting(low=0, above=True, high=100)] = 0.5
+    stale_s: Annotated[float, Setting(unit="s", low=0)] = 2.0
+    last_good_s: Annotated[float, Setting(unit="s", low=0, above=True)] = 60.0
+    learner: dict[str, Any] = field(default_factory=dict)
+    diagnosis: WatchConfig = field(default_factory=WatchConfig)
+    competition: CompetitionConfig = field(default_factory=CompetitionConfig)
+    retuning: RetuningConfig = field(default_factory=RetuningConfig)
+    correction: CorrectionConfig = field(default_factory=CorrectionConfig)
+    repetition: RepetitionConfig = field(default_factory=RepetitionConfig)
 
 
 @dataclass(frozen=True, slots=True)
 class ServeConfig:
-    """A whole service: one stage, one or more axes."""
+    """A whole service: one stage, one or more axes.
 
-    stage: Annotated[
-        str,
-        Setting(help="name of the stage on the wire: a-z, 0-9, _ and -", check=check_name, example="demo", shown=True),
-    ]
-    axes: Annotated[tuple[AxisConfig, ...], Setting(key="axis", help="one such table for each axis", shown=True)] = ()
-    fleet: Annotated[
-        FleetSettings | None, Setting(help="many axes as one batch, in place of [[axis]] tables; see docs/fleet.md")
-    ] = None
-    listen: Annotated[
-        tuple[str, ...],
-        Setting(help="where controllers, stage and viewer connect", check=check_endpoint, shown=True),
-    ] = (DEFAULT_ENDPOINT,)
-    connect: Annotated[
-        tuple[str, ...], Setting(help="routers or other services to connect to", check=check_endpoint)
-    ] = ()
-    zenoh_config: Annotated[
-        Path | None,
-        Setting(
-            help="TLS and access control for other machines, from 'dehyst access init'",
-            example="service.json5",
-        ),
-    ] = None
-    standby_listen: Annotated[
-        tuple[str, ...],
-        Setting(help="where 'dehyst serve --standby' listens; clients look for it there", check=check_endpoint),
-    ] = ()
-    key: Annotated[
-        Path | None,
-        Setting(
-            help="file with the shared key; default: this user's, which the first start makes (docs/access.md)",
-            example="dehyst.key",
-        ),
-    ] = None
-    open: Annotated[
-        bool, Setting(help="true: no key; nothing is signed, and everybody on the wire is believed (--open)")
-    ] = False
-    busy_after_s: Annotated[
-        float,
-        Setting(
-            help="a query for more than 128 points that would take longer than this is refused as busy",
-            unit="s",
-            low=0.01,
-            high=60,
-        ),
-    ] = 0.5
-    lease_s: Annotated[
-        float, Setting(help="silence after which a service counts as dead", unit="s", low=0.1, high=60)
-    ] = 1.0
-    insecure_beyond_loopback: Annotated[
-        bool, Setting(help="true: whoever reaches an address on another machine may do everything")
-    ] = False
+    Attributes
+    ----------
+    stage : name of the stage on the wire: a-z, 0-9, _ and -.
+    axis : one such table for each axis.
+    fleet : many axes as one batch, in place of [[axis]] tables; see docs/fleet.md.
+    listen : where controllers, stage and viewer connect.
+    connect : routers or other services to connect to.
+    zenoh_config : TLS and access control for other machines, from 'dehyst access init'.
+    standby_listen : where 'dehyst serve --standby' listens; clients look for it there.
+    key : file with the shared key; default: this user's, which the first start makes (docs/access.md).
+    open : true: no key; nothing is signed, and everybody on the wire is believed (--open).
+    busy_after_s : a query for more than 128 points that would take longer than this is refused as busy.
+    lease_s : silence after which a service counts as dead.
+    insecure_beyond_loopback : true: whoever reaches an address on another machine may do everything.
+    """
+
+    stage: Annotated[str, Setting(check=check_name, example="demo", shown=True)]
+    axes: Annotated[tuple[AxisConfig, ...], Setting(key="axis", shown=True)] = ()
+    fleet: FleetSettings | None = None
+    listen: Annotated[tuple[str, ...], Setting(check=check_endpoint, shown=True)] = (DEFAULT_ENDPOINT,)
+    connect: Annotated[tuple[str, ...], Setting(check=check_endpoint)] = ()
+    zenoh_config: Annotated[Path | None, Setting(example="service.json5")] = None
+    standby_listen: Annotated[tuple[str, ...], Setting(check=check_endpoint)] = ()
+    key: Annotated[Path | None, Setting(example="dehyst.key")] = None
+    open: bool = False
+    busy_after_s: Annotated[float, Setting(unit="s", low=0.01, high=60)] = 0.5
+    lease_s: Annotated[float, Setting(unit="s", low=0.1, high=60)] = 1.0
+    insecure_beyond_loopback: bool = False
 
 
 def read_config(path: Path | str, insecure_beyond_loopback: bool = False) -> ServeConfig:

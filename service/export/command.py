@@ -1,4 +1,13 @@
-"""``dehyst export``: a model for a controller that runs without the service, as C, tables and an FMU."""
+"""``dehyst export``: a model for a controller that runs without the service, as C, tables and an FMU.
+
+The exported model is frozen: it learns no further, and no stand-in takes its place outside the learnt range (flag 4).
+
+  dehyst export stage.npz --out exported                            # C with its test, and tables
+  dehyst export stage.npz --out exported --model mpi --u-max 8 --slew 2000 --fmu
+  dehyst export --from-service dehyst/v1/demo/x --out exported      # what a running service has learnt until now
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +15,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import ROOT, Keys
 
@@ -14,18 +23,9 @@ if TYPE_CHECKING:
     from dehyst.service.answers.guard import Limits
     from dehyst.service.export.exporting import Frozen
 
-EPILOG = """\
-The exported model is frozen: it learns no further, and no stand-in takes its place outside the learnt range (flag 4).
-
-  dehyst export stage.npz --out exported                            # C with its test, and tables
-  dehyst export stage.npz --out exported --model mpi --u-max 8 --slew 2000 --fmu
-  dehyst export --from-service dehyst/v1/demo/x --out exported      # what a running service has learnt until now
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("data", nargs="?", type=Path, metavar="MODEL.npz", help="model file from 'dehyst identify'")
     add("--from-service", metavar="KEY", help=f"take the model and limits of a running service: {ROOT}/STAGE/AXIS")

@@ -1,25 +1,28 @@
-"""Command-line options that describe the columns of a recording, shared by all commands that read one."""
+"""Command-line options that describe the columns of a recording, shared by all commands that read one.
+
+Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
+options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
+text with or without a header line, .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
+(or a folder of a recorder's segments), .feather, .json. Examples: docs/recordings.md.
+"""
 
 from __future__ import annotations
 
 import argparse
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from dehyst.adaptive.errors import InputError
+from dehyst.service.cli.options import check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.sim.recordings import ColumnMap, Finding, Recording, load_map, read
 from dehyst.sim.recordings.columns import QUANTITIES, MissingError
 
-READING = """\
-Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
-options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
-text with or without a header line, .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
-(or a folder of a recorder's segments), .feather, .json. Examples: docs/recordings.md.
-"""
+T = TypeVar("T")
 
 
 def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False) -> None:
@@ -29,7 +32,7 @@ def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False
     """
     quantities = ", ".join(QUANTITIES)
     units = "; ".join(f"{quantity}: {' '.join(factors)}" for quantity, (_, factors) in QUANTITIES.items())
-    group = parser.add_argument_group("what the file's columns mean", READING)
+    group = parser.add_argument_group("what the file's columns mean", (__doc__ or "").partition("\n\n")[2])
     group.add_argument(
         "--map", type=Path, metavar="FILE.toml", help="read these options from a file; the command line overrides it"
     )
@@ -71,28 +74,18 @@ def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
     Raises InputError.
     """
     base = load_map(args.map) if args.map is not None else ColumnMap()
-    scale: dict[str, float] = {}
-    for quantity, text in _pairs("--scale", args.scale).items():
-        try:
-            scale[quantity] = float(text)
-        except ValueError:
-            raise FieldError("--scale", f"{quantity}={text}", "Q=FACTOR with a number") from None
-    units = _pairs("--unit", args.unit)
+    scale, units = _pairs("--scale", args.scale, float), _pairs("--unit", args.unit, str)
     # An option overrides the file, also if one gives a unit and the other a scale.
     kept_units = {q: unit for q, unit in base.units.items() if q not in scale}
     kept_scale = {q: factor for q, factor in base.scale.items() if q not in units}
-    scalars = {
-        name: value
-        for name in ("dt_s", "sensor_late", "delimiter", "decimal", "header")
-        if (value := getattr(args, name)) is not None
-    }
+    names = ("dt_s", "sensor_late", "delimiter", "decimal", "header")
+    scalars = {name: value for name in names if (value := getattr(args, name)) is not None}
     if args.rate is not None:
-        if not 0.0 < args.rate < 1e9:
-            raise FieldError("--rate", args.rate, "a positive number of samples per second")
+        check_number("--rate", args.rate, "Hz", low=0, above=True, high=1e9)
         scalars["dt_s"] = 1.0 / args.rate
-    files = base.files | {quantity: Path(name) for quantity, name in _pairs("--file", args.file).items()}
+    files = base.files | _pairs("--file", args.file, Path)
     if test:
-        tested = {quantity: Path(name) for quantity, name in _pairs("--test-file", args.test_file).items()}
+        tested = _pairs("--test-file", args.test_file, Path)
         if tested.keys() != files.keys():
             raise FieldError(
                 "--test-file",
@@ -105,21 +98,26 @@ def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
         base,
         files=files,
         repeat=tuple(args.repeat) or base.repeat,
-        columns=base.columns | _pairs("--column", args.column),
+        columns=base.columns | _pairs("--column", args.column, str),
         units=kept_units | units,
         scale=kept_scale | scale,
-        index=base.index | _pairs("--index", args.index),
+        index=base.index | _pairs("--index", args.index, str),
         **scalars,
     )
 
 
-def _pairs(option: str, texts: list[str]) -> dict[str, str]:
-    pairs: dict[str, str] = {}
+def _pairs(option: str, texts: list[str], kind: Callable[[str], T]) -> dict[str, T]:
+    pairs: dict[str, T] = {}
     for text in texts:
-        quantity, equals, value = text.partition("=")
-        if not equals or not value or quantity not in QUANTITIES:
-            raise FieldError(option, repr(text), f"QUANTITY=VALUE with one of {', '.join(QUANTITIES)}")
-        pairs[quantity] = value
+        quantity, _, value = text.partition("=")
+        try:
+            if not value or quantity not in QUANTITIES:
+                raise ValueError
+            pairs[quantity] = kind(value)
+        except ValueError:
+            number = "a number and " if kind is float else ""
+            expected = f"QUANTITY=VALUE with {number}one of {', '.join(QUANTITIES)}"
+            raise FieldError(option, repr(text), expected) from None
     return pairs
 
 

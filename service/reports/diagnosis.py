@@ -14,7 +14,7 @@ from dehyst.service.reports.plot_style import figure, label, legend, line, save
 from dehyst.service.viewer import colours
 from dehyst.service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
 from dehyst.sim.diagnosis.export import export_stage
-from dehyst.sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause, picture
+from dehyst.sim.diagnosis.result import Diagnosis, NamedCause, picture
 from dehyst.sim.pictures import MEASURED, WITH, WITHOUT
 from dehyst.sim.stage.file import save_stage
 
@@ -23,17 +23,17 @@ __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
 _ROLES = {MEASURED: colours.MEASURED, WITHOUT: BEFORE, WITH: AFTER}
 
 
-def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, schema: int = SCHEMAS[-1]) -> dict[str, Any]:
+def write_report(out: Path, diagnosis: Diagnosis, source: Source) -> dict[str, Any]:
     """Write all files into the folder ``out`` and return the content of report.json.
 
-    ``schema``: that of report.json, one of `SCHEMAS`. Raises InputError if the folder cannot be written.
+    Raises InputError if the folder cannot be written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
         # Remove the pictures of an earlier diagnosis in this folder.
         for old in out.glob("[0-9]-*.png"):
             old.unlink()
-        data = diagnosis.as_dict(schema)
+        data = diagnosis.as_dict()
         (out / "report.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
         exported = export_stage(diagnosis)
         save_stage(exported.config, out / "stage.toml")

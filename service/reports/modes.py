@@ -42,161 +42,130 @@ def page(study: ModalStudy, *, pictures: bool = True) -> str:
     model, levels = study.fit.model, study.levels
     low, high = levels[0].response.spectra.amplitude_V, levels[-1].response.spectra.amplitude_V
     outputs, drives = model.coefficients.shape[2:]
-    several = len(levels) > 1
-    reals = len(model.theta) - 2 * model.modes
-    lines = [
-        f"# {len(study.modes)} modes of {drives} {_plural('drive', drives)} and {outputs} {_plural('output', outputs)}",
-        "",
-        f"One model for all recordings: {model.modes} pole pairs and {reals} real {_plural('pole', reals)}, "
-        "common to all drives and outputs."
-        + (
-            f" Poles and residues are polynomials of degree {model.degree} in the rms of the drive, {low:.3g} to "
-            f"{high:.3g} V."
-            if several
-            else ""
-        )
-        + (
-            ""
-            if study.fit.converged
-            else " **The search ended at its last step, not at a minimum**: start from fewer modes (`--start-modes`)."
-        ),
-        "",
+    several, reals = len(levels) > 1, len(model.theta) - 2 * model.modes
+    parts = [
+        f"# {len(study.modes)} modes of {_count(drives, 'drive')} and {_count(outputs, 'output')}",
+        f"One model for all recordings: {model.modes} pole pairs and {_count(reals, 'real pole')}, common to all "
+        "drives and outputs.",
+        f"Poles and residues are polynomials of degree {model.degree} in the rms of the drive, {low:.3g} to {high:.3g} "
+        "V." * several,
+        "" if study.fit.converged else NOT_CONVERGED,
         "## Errors",
-        "",
-        *errors_table(levels),
-        "",
-        "Rms over realisations, mean of the outputs, of measured minus computed mean period in steady state. *Noise*: "
-        "of the mean period, from the spread between periods; no model can be better. *Noise and distortion*: what the "
-        "realisations of one amplitude do not have in common; no linear model of that amplitude can be better."
-        + (
-            " *One linear model*: the same poles, held constant, with one set of residues for all amplitudes; what it "
-            "has more is what changes with the amplitude."
-            if several
-            else ""
-        ),
-        "",
+        errors_table(levels),
+        ERRORS + ONE_LINEAR * several,
+        _verdict(levels),
+        PICTURES if pictures else "",
+        "## Modes",
+        modes_table(study.modes),
+        _changes(study.modes, low, high) if several else "",
+        "## The recordings" if study.notes else "",
+        "\n".join(f"- {note}" for note in study.notes),
     ]
-    lines += _verdict(levels)
-    if pictures:
-        lines += ["![measured and computed response](response.png)", "", "![what is left, and the noise](left.png)", ""]
-    lines += ["## Modes", "", *modes_table(study.modes), ""]
-    if several:
-        lines += ["## Change with the amplitude", "", *_changes(study.modes, low, high)]
-    if study.notes:
-        lines += ["## The recordings", "", *(f"- {note}" for note in study.notes), ""]
-    return "\n".join(lines)
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
+NOT_CONVERGED = "**The search ended at its last step, not at a minimum**: start from fewer modes (`--start-modes`)."
+ERRORS = (
+    "Rms over realisations, mean of the outputs, of measured minus computed mean period in steady state. *Noise*: of "
+    "the mean period, from the spread between periods; no model can be better. *Noise and distortion*: what the "
+    "realisations of one amplitude do not have in common; no linear model of that amplitude can be better."
+)
+ONE_LINEAR = (
+    " *One linear model*: the same poles, held constant, with one set of residues for all amplitudes; what it has more "
+    "is what changes with the amplitude."
+)
+PICTURES = "![measured and computed response](response.png)\n\n![what is left, and the noise](left.png)"
+CHANGES = f"""\
+A hysteresis loop in a mode's stiffness makes it softer and more damped: for Rayleigh's loop the damping ratio rises \
+by 4/(3π) = {RAYLEIGH_RATIO:.2f} of the relative fall of the frequency. An elastic softening adds no damping. A loop \
+in front of the modes (in the actuator) changes their gain and leaves frequency and damping."""
 #: A held-out error within this factor of noise and distortion is at the limit of linear models.
 AT_THE_LIMIT = 1.25
 
 
-def _verdict(levels: Sequence[Level]) -> list[str]:
-    """What the remaining error is, where the realisations show it; as lines of Markdown."""
-    judged = [level for level in levels if level.test_um is not None and level.response.knows_distortion]
+def _verdict(levels: Sequence[Level]) -> str:
+    """What the remaining error is, where the realisations show it."""
+    known = [(level.test_um, level.response) for level in levels if level.response.knows_distortion]
+    judged = [(test_um, response) for test_um, response in known if test_um is not None]
     if not judged:
-        return []
-    ratios = [
-        float(level.test_um.mean() / level.response.distortion_um.mean())
-        for level in judged
-        if level.test_um is not None
-    ]
-    text = f"Held-out error over noise and distortion: {', '.join(f'{ratio:.2f}' for ratio in ratios)}. "
-    text += (
+        return ""
+    ratios = [float(test_um.mean() / response.distortion_um.mean()) for test_um, response in judged]
+    text = f"Held-out error over noise and distortion: {', '.join(f'{ratio:.2f}' for ratio in ratios)}. " + (
         "The modes explain all that a linear model of each amplitude can explain."
         if max(ratios) <= AT_THE_LIMIT
         else "There is more to explain by linear dynamics: start from more modes, or record more realisations."
     )
-    over = [
-        float(level.response.distortion_um.mean() / level.response.spectra.floor_um.mean())
-        for level in judged
-        if np.isfinite(level.response.spectra.floor_um).all()
-    ]
-    if over and max(over) > 2.0:
+    floors = [(response.distortion_um.mean(), response.spectra.floor_um) for _, response in judged]
+    over = max((distortion / floor.mean() for distortion, floor in floors if np.isfinite(floor).all()), default=0.0)
+    if over > 2.0:
         text += (
-            f" Noise and distortion are up to {max(over):.2g} times the noise alone: this part is nonlinear within one "
+            f" Noise and distortion are up to {over:.2g} times the noise alone: this part is nonlinear within one "
             "amplitude, and only a nonlinear model can explain it."
         )
-    return [text, ""]
+    return text
 
 
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
+def _count(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def errors_table(levels: Sequence[Level]) -> list[str]:
-    """Errors by amplitude, µm, as lines of Markdown."""
-    several = len(levels) > 1
+def errors_table(levels: Sequence[Level]) -> str:
+    """Errors by amplitude, µm, in Markdown."""
     head = ["drive / V rms", "output / µm rms", "noise", "noise and distortion", "training", "held out", "by output"]
     rows = []
     for level in levels:
-        spectra = level.response.spectra
+        spectra, distortion_um = level.response.spectra, level.response.distortion_um
         shown = level.train_um if level.test_um is None else level.test_um
-        row = [
+        rows.append([
             f"{spectra.amplitude_V:.4g}",
             f"{spectra.signal_um.mean():.3f}",
             f"{spectra.floor_um.mean():.4f}" if np.isfinite(spectra.floor_um).all() else "not known",
-            f"{level.response.distortion_um.mean():.4f}" if level.response.knows_distortion else "not known",
+            f"{distortion_um.mean():.4f}" if level.response.knows_distortion else "not known",
             f"{level.train_um.mean():.4f}",
             "none" if level.test_um is None else f"{level.test_um.mean():.4f}",
             ", ".join(f"{value:.4f}" for value in shown),
-        ]
-        rows.append([*row, f"{level.constant_um.mean():.4f}"] if several else row)
-    return markdown([*head, "one linear model"] if several else head, rows, left=(len(head) - 1,)).split("\n")
+            f"{level.constant_um.mean():.4f}",
+        ])  # fmt: skip
+    columns = len(head) + (len(levels) > 1)
+    return markdown([*head, "one linear model"][:columns], [row[:columns] for row in rows], left=(len(head) - 1,))
 
 
-def modes_table(modes: Sequence[Mode]) -> list[str]:
-    """Frequencies, dampings and participation as lines of Markdown."""
+def modes_table(modes: Sequence[Mode]) -> str:
+    """Frequencies, dampings and participation in Markdown, and what they mean."""
     if not modes:
-        return ["No pair is weakly damped and large enough to be called a mode."]
-    several = modes[0].frequency_hz.size > 1
-    outputs = modes[0].participation_um.size
-    head = ["frequency / Hz", "damping / %", *(f"y{i + 1} / µm" for i in range(outputs))]
-    if several:
-        head += ["softening / %", "damping at the end / %", "gain change / %"]
-    rows = []
-    for mode in modes:
-        row = [
+        return "No pair is weakly damped and large enough to be called a mode."
+    outputs = [f"y{i + 1} / µm" for i in range(modes[0].participation_um.size)]
+    head = ["frequency / Hz", "damping / %", *outputs, "softening / %", "damping at the end / %", "gain change / %"]
+    rows = [
+        [
             f"{mode.frequency_hz[0]:.2f} ± {mode.frequency_half_hz[0]:.2g}",
             f"{100.0 * mode.damping[0]:.3f} ± {100.0 * mode.damping_half[0]:.2g}",
             *(f"{value:.3f}" for value in mode.participation_um),
+            f"{-100.0 * mode.frequency_change:.3f} ± {100.0 * mode.frequency_change_half:.2g}",
+            f"{100.0 * mode.damping[-1]:.3f} ± {100.0 * mode.damping_half[-1]:.2g}",
+            f"{100.0 * mode.gain_change:+.1f}",
         ]
-        if several:
-            row += [
-                f"{-100.0 * mode.frequency_change:.3f} ± {100.0 * mode.frequency_change_half:.2g}",
-                f"{100.0 * mode.damping[-1]:.3f} ± {100.0 * mode.damping_half[-1]:.2g}",
-                f"{100.0 * mode.gain_change:+.1f}",
-            ]
-        rows.append(row)
+        for mode in modes
+    ]
+    several = modes[0].frequency_hz.size > 1
+    columns = len(head) if several else len(head) - 3
     end = (
         " Frequency and damping are those at the smallest amplitude; softening is the fall of the frequency to the "
         "largest one, gain change that of the residues' norm."
-        if several
-        else ""
     )
-    return [
-        markdown(head, rows, left=()),
-        "",
-        "± is half of the 95 % interval. yN: the mode's rms contribution to an output for flat lines on all drives, at "
-        f"the middle amplitude; contributions of close modes overlap.{end}",
-    ]
+    return markdown(head[:columns], [row[:columns] for row in rows], left=()) + (
+        "\n\n± is half of the 95 % interval. yN: the mode's rms contribution to an output for flat lines on all drives "
+        f"at the middle amplitude; contributions of close modes overlap.{end * several}"
+    )
 
 
-def _changes(modes: Sequence[Mode], low_V: float, high_V: float) -> list[str]:
+def _changes(modes: Sequence[Mode], low_V: float, high_V: float) -> str:
     changing = sorted((mode for mode in modes if mode.finding != "steady"), key=lambda mode: -mode.error_share)
     steady = [f"{mode.frequency_hz[0]:.4g}" for mode in modes if mode.finding == "steady"]
     lines = [f"- {mode.sentence(low_V, high_V)}" for mode in changing]
     if steady:
-        lines.append(f"- No measurable change: the {_plural('mode', len(steady))} at {', '.join(steady)} Hz.")
-    return [
-        *lines,
-        "",
-        "A hysteresis loop in a mode's stiffness makes it softer and more damped: for Rayleigh's loop the damping "
-        f"ratio rises by 4/(3π) = {RAYLEIGH_RATIO:.2f} of the relative fall of the frequency. An elastic softening "
-        "adds no damping. A loop in front of the modes (in the actuator) changes their gain and leaves frequency and "
-        "damping.",
-        "",
-    ]
+        lines.append(f"- No measurable change: {_count(len(steady), 'mode')} at {', '.join(steady)} Hz.")
+    return "\n".join(["## Change with the amplitude", "", *lines, "", CHANGES])
 
 
 def _db(values: FloatArray) -> FloatArray:

@@ -27,20 +27,12 @@ _OPTIONS: Final = {_ARENA_MAX: 2, _MMAP_THRESHOLD: 256 * 1024, _TRIM_THRESHOLD: 
 
 def keep_little() -> bool:
     """Use few heaps, and keep large blocks out of them. False, without effect, if the C library is not glibc."""
-    if not sys.platform.startswith("linux"):
-        return False
-    with contextlib.suppress(OSError, AttributeError):
-        return all([_library().mallopt(option, value) == 1 for option, value in _OPTIONS.items()])
-    return False
+    return all([_asked("mallopt", option, value) == 1 for option, value in _OPTIONS.items()])
 
 
 def give_back() -> bool:
     """Return free memory of the heaps to the system. False if the C library is not glibc."""
-    if not sys.platform.startswith("linux"):
-        return False
-    with contextlib.suppress(OSError, AttributeError):
-        return bool(_library().malloc_trim(0) >= 0)
-    return False
+    return _asked("malloc_trim", 0) is not None
 
 
 @contextlib.contextmanager
@@ -82,26 +74,24 @@ def in_use() -> dict[str, int | None]:
     resident_bytes = None
     with contextlib.suppress(OSError):  # no file descriptor is left: a status needs none
         resident_bytes = int(_PROCESS.memory_info().rss)
-    return {
-        "resident_bytes": resident_bytes,
-        "malloc_bytes": _malloc_bytes(),
-        "python_blocks": sys.getallocatedblocks(),
-    }
+    told = _asked("mallinfo2")
+    malloc_bytes = None if told is None else int(told.uordblks + told.hblkhd)
+    blocks = sys.getallocatedblocks()
+    return {"resident_bytes": resident_bytes, "malloc_bytes": malloc_bytes, "python_blocks": blocks}
 
 
-def _malloc_bytes() -> int | None:
+def _asked(function: str, *values: int) -> Any:
+    """What a function of glibc returns; None if the C library is another one, or older than the function."""
     if not sys.platform.startswith("linux"):
         return None
     with contextlib.suppress(OSError, AttributeError):
-        told = _library().mallinfo2()
-        return int(told.uordblks + told.hblkhd)
-    return None
+        return getattr(_library(), function)(*values)
 
 
 @cache
 def _library() -> ctypes.CDLL:
     """The C library, opened once: each opening leaves classes in reference cycles behind."""
     library = ctypes.CDLL(None)
-    with contextlib.suppress(AttributeError):  # the C library is older than this function, or another one
+    with contextlib.suppress(AttributeError):
         library.mallinfo2.restype = _Mallinfo2
     return library

@@ -53,6 +53,14 @@ class StopSignal:
             select.select([self._read], [], [], min(0.5, rest_s))
         return self.reason or "time is over"
 
+    def every(self, period_s: float, duration_s: float | None = None) -> Iterator[None]:
+        """Yields after each period, until a signal comes or the time is over."""
+        until = math.inf if duration_s is None else time.monotonic() + duration_s
+        while not self.reason and (rest_s := until - time.monotonic()) > 0.0:
+            self.wait(min(period_s, rest_s))
+            if not self.reason and rest_s > period_s:
+                yield
+
     def look(self) -> None:
         """Raises KeyboardInterrupt if a signal has come."""
         if self.reason:

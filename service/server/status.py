@@ -148,55 +148,51 @@ class Publications:
         self._diagnostics: dict[str, Any] = {}
         self._status_at_s = 0.0
         self._publishers: dict[str, Any] = {}
-        self._standby: Any = None
+
+    def _declare(self, name: str, key: str, drop: bool = True, **options: Any) -> Any:
+        congestion = zenoh.CongestionControl.DROP if drop else SURELY
+        publisher = self._session.declare_publisher(key, congestion_control=congestion, **options)
+        self._publishers[name] = publisher
+        return publisher
 
     def listen(self) -> None:
         """Publish the status of a standby from now on."""
-        self._standby = self._session.declare_publisher(
-            self._keys.standby(self._instance), congestion_control=zenoh.CongestionControl.DROP, encoding=JSON
-        )
+        self._declare("standby", self._keys.standby(self._instance), encoding=JSON)
 
     def serve(self) -> None:
         """Publish everything from now on."""
-        session, keys = self._session, self._keys
-        drop = zenoh.CongestionControl.DROP
-        self._publishers = {
-            "model": session.declare_publisher(keys.model, congestion_control=drop),
-            "champion": session.declare_publisher(keys.champion, congestion_control=drop),
-            "diagnostics": session.declare_publisher(keys.diagnostics, congestion_control=drop, encoding=JSON),
-            "status": session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON),
-            "event": session.declare_publisher(keys.event, congestion_control=SURELY, encoding=JSON),
-        }
+        keys = self._keys
+        self._declare("model", keys.model)
+        self._declare("champion", keys.champion)
+        self._declare("diagnostics", keys.diagnostics, encoding=JSON)
+        self._declare("status", keys.status, encoding=JSON)
+        self._declare("event", keys.event, drop=False, encoding=JSON)
         if self._axis.config.delta_hz > 0.0 and self._axis.config.learn:
             for key, name in ((keys.model_delta, self._axis.config.learn), (keys.champion_delta, AUTO)):
                 if name in self._axis.newest.models:
                     # A class of its own: in that of the samples, which pass through here, two waiting messages fill
                     # the queue, and a change would be dropped.
-                    urgent = zenoh.Priority.INTERACTIVE_HIGH
-                    publisher = session.declare_publisher(key, congestion_control=drop, express=True, priority=urgent)
-                    self._publishers[key] = publisher
+                    publisher = self._declare(key, key, express=True, priority=zenoh.Priority.INTERACTIVE_HIGH)
                     self._deltas.publish(name, partial(self._put, key), partial(is_followed, publisher))
 
     def stand_down(self) -> None:
         """Publish the events that wait, and then only the status of a standby."""
         self.publish_events()
         self._deltas.close()
-        publishers, self._publishers = self._publishers, {}
-        for publisher in publishers.values():
-            publisher.undeclare()
+        for name in self._publishers.keys() - {"standby"}:
+            self._publishers.pop(name).undeclare()
 
     def close(self) -> None:
         """End what `listen` began; after `stand_down`."""
-        if self._standby is not None:
-            self._standby.undeclare()
-            self._standby = None
+        if standby := self._publishers.pop("standby", None):
+            standby.undeclare()
 
     def tick(self, now_s: float) -> None:
         """Publish what is due at ``now_s`` (``time.monotonic``)."""
         due = now_s - self._status_at_s >= STATUS_PERIOD_S
         if due:
             self._status_at_s = now_s
-        if self._publishers:
+        if "status" in self._publishers:
             self._deltas.tick(now_s)
             self._publish_models(now_s)
             self._publish_diagnostics()
@@ -204,10 +200,8 @@ class Publications:
                 self._loop.figures.follow(is_followed(self._publishers["diagnostics"]))
                 self._put("status", to_json(self._status()))
             self.publish_events()
-        elif due and self._standby is not None:
-            payload = to_json(self._status())
-            attached = self._by.published(self._keys.standby(self._instance), payload)
-            self._standby.put(payload, attachment=attached)
+        elif due and "standby" in self._publishers:
+            self._put("standby", to_json(self._status()))
 
     def _put(self, name: str, payload: bytes) -> None:
         """Publish what others act upon."""

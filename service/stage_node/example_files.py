@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 import pyarrow
+from numpy.typing import ArrayLike
 from pyarrow import parquet
 
 from dehyst.adaptive.types import FloatArray
@@ -17,15 +18,28 @@ from dehyst.sim.stage.file import save_stage
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
-#: Files and folders that are written.
-NAMES: Final = (
-    "recording.csv", "recording.parquet", "scope.csv", "train.csv", "test.csv", "training.parquet", "other.parquet",
-    "multisine.npz", "drive.npy", "readings.npy", "recordings", "low.npz", "high.npz", "train.npz", "test.npz", "a.csv",
-    "b.csv", "c.csv", "serve.toml", "learner.toml", "mystage.toml", "mine.py", "trajectory.csv",
-)  # fmt: skip
-#: Sample time of the recordings, s. Length of the short ones, and of those of which a range is used, s.
-DT_S: Final = 1e-3
-SHORT_S, LONG_S = 12.0, 41.0
+#: Files and folders that are written, and what they are.
+FILES: Final = {
+    "recording.csv": "12 s of the simulated stage, 0 to 8 V, 1 kHz",
+    "scope.csv": "the same as an oscilloscope shows it: ms, CH1 the drive in V, CH2 the sensor, 10 µm/V",
+    "train.csv": "another motion of 12 s",
+    "test.csv": "a third one",
+    "recordings": "x/ in it: a segment as the recorder of a service writes it",
+    "drive.npy": "one period of a drive, 10 kHz",
+    "readings.npy": "readings of 8 periods of it",
+    "low.npz": "two drives and two outputs for 'dehyst modes'",
+    "high.npz": "the same at a larger amplitude",
+    "a.csv": "three drives and two outputs",
+    "b.csv": "a second realisation of them",
+    "c.csv": "a third one",
+    "serve.toml": "for a service with the stage.npz that 'dehyst identify' writes",
+    "learner.toml": "settings of the learner",
+    "mystage.toml": "a stage file, to compare a recording with",
+    "mine.py": "a plant for 'dehyst rehearse'",
+    "trajectory.csv": "points for 'dehyst query'",
+}
+#: Sample time and length of the recordings, s.
+DT_S, LENGTH_S = 1e-3, 12.0
 #: Periods of the drive that readings.npy holds, samples of one, and their sample time, s.
 PERIODS, PERIOD, PERIOD_DT_S = 8, 5000, 1e-4
 #: Where the standby of the examples listens.
@@ -64,31 +78,26 @@ def run(u_V):
 '''
 
 
-def write_examples(folder: Path) -> list[tuple[str, str]]:
-    """Write all files into ``folder``, which is made. Returns (name, description) of each.
+def write_examples(folder: Path) -> None:
+    """Write all `FILES` into ``folder``, which is made.
 
     Raises FieldError where one of the files is there already: none is replaced; OSError from the disk.
     """
-    if there := [name for name in NAMES if (folder / name).exists()]:
+    if there := [name for name in FILES if (folder / name).exists()]:
         raise FieldError(
             "--examples", f"{folder} with {', '.join(there)} in it", "a folder without files of these names",
             "name a new folder: no file is replaced",
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    said = [*_of_the_stage(folder), *_periodic(folder)]
-    (folder / "learner.toml").write_text(LEARNER_TOML, encoding="utf-8")
-    (folder / "mine.py").write_text(MINE_PY, encoding="utf-8")
+    _recordings(folder)
+    _periodic(folder)
+    texts = {
+        "learner.toml": LEARNER_TOML, "mine.py": MINE_PY, "serve.toml": _configuration(),
+        "trajectory.csv": "y,v,a\n40,0,0\n40.1,100,0\n40.2,100,0\n",
+    }  # fmt: skip
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
     save_stage(preset("bouc_wen"), folder / "mystage.toml")
-    (folder / "trajectory.csv").write_text("y,v,a\n40,0,0\n40.1,100,0\n40.2,100,0\n", encoding="utf-8")
-    (folder / "serve.toml").write_text(_configuration(), encoding="utf-8")
-    return [
-        *said,
-        ("serve.toml", "for a service with the stage.npz that 'dehyst identify' writes"),
-        ("learner.toml", "settings of the learner"),
-        ("mystage.toml", "a stage file, to compare a recording with"),
-        ("mine.py", "a plant for 'dehyst rehearse'"),
-        ("trajectory.csv", "points for 'dehyst query'"),
-    ]
 
 
 def _configuration() -> str:
@@ -100,54 +109,35 @@ def _configuration() -> str:
     return text
 
 
-def _of_the_stage(folder: Path) -> list[tuple[str, str]]:
-    """Recordings of the stage that ``dehyst stage`` simulates, 0 to 8 V, 1 kHz."""
-    made = {
-        "recording": training_input(DT_S, SHORT_S)[1],
-        "train": _motion(SHORT_S, 1),
-        "test": generalisation_input(DT_S, SHORT_S)[1],
-        "training": _motion(LONG_S, 2),
-        "other": _motion(LONG_S, 3),
-        "multisine": _motion(LONG_S, 4),
+def _write(path: Path, header: str, *columns: ArrayLike) -> None:
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g")
+
+
+def _recordings(folder: Path) -> None:
+    """Recordings of the stage that ``dehyst stage`` simulates."""
+    # Many tones over the whole drive: a model of a part of it is wrong at rest.
+    tones = multitone(LENGTH_S, DT_S, seed=1)[1]
+    drives = {
+        "recording": training_input(DT_S, LENGTH_S)[1],
+        "train": 8.0 * (tones - tones.min()) / np.ptp(tones),
+        "test": generalisation_input(DT_S, LENGTH_S)[1],
     }
-    rows = {name: np.column_stack([np.arange(u_V.size) * DT_S, u_V, _readings(u_V)]) for name, u_V in made.items()}
-    for name in ("recording", "train", "test"):
-        np.savetxt(folder / f"{name}.csv", rows[name], delimiter=",", header="t_s,u_V,y_um", comments="", fmt="%.9g")
-    for name in ("recording", "training", "other"):
-        columns = dict(zip(("t_s", "u_V", "y_um"), rows[name].T, strict=True))
-        parquet.write_table(pyarrow.table(columns), folder / f"{name}.parquet")
-    _, u_V, y_um = rows["multisine"].T
-    np.savez(folder / "multisine.npz", u_V=u_V, y_um=y_um, dt_s=DT_S)
-    scope = rows["recording"] * (1e3, 1.0, 0.1)
-    header = "Time,CH1,CH2\nms,V,V"
-    np.savetxt(folder / "scope.csv", scope, delimiter=",", header=header, comments="", fmt="%.9g")
-    recorded = folder / "recordings" / "x"
-    recorded.mkdir(parents=True, exist_ok=True)
-    t_s, u_V, y_um = rows["test"].T
-    segment = {"seq": np.arange(t_s.size), "t_s": t_s, "u_V": u_V, "y_um": y_um, "reason": ["learnt"] * t_s.size}
-    parquet.write_table(pyarrow.table(segment), recorded / "segment-000001.parquet")
+    for name, u_V in drives.items():
+        t_s, y_um = np.arange(u_V.size) * DT_S, _readings(u_V)
+        _write(folder / f"{name}.csv", "t_s,u_V,y_um", t_s, u_V, y_um)
+        if name == "recording":
+            _write(folder / "scope.csv", "Time,CH1,CH2\nms,V,V", 1e3 * t_s, u_V, 0.1 * y_um)
+        if name == "test":
+            (folder / "recordings" / "x").mkdir(parents=True)
+            columns = {"seq": np.arange(u_V.size), "t_s": t_s, "u_V": u_V, "y_um": y_um}
+            segment = pyarrow.table({**columns, "reason": ["learnt"] * u_V.size})
+            parquet.write_table(segment, folder / "recordings" / "x" / "segment-000001.parquet")
     period = np.arange(PERIOD) * PERIOD_DT_S
     drive_V = 4.0 - 3.0 * np.cos(4.0 * np.pi * period) + 0.5 * np.sin(40.0 * np.pi * period)
     np.save(folder / "drive.npy", drive_V)
     # The first two periods are the way to the steady state.
     readings = _readings(np.tile(drive_V, PERIODS + 2), PERIOD_DT_S).reshape(PERIODS + 2, PERIOD)[2:]
     np.save(folder / "readings.npy", readings)
-    return [
-        ("recording.csv, recording.parquet", "12 s of the simulated stage, 0 to 8 V, 1 kHz"),
-        ("scope.csv", "the same as an oscilloscope shows it: ms, CH1 the drive in V, CH2 the sensor, 10 µm/V"),
-        ("train.csv, test.csv", "two other motions of 12 s"),
-        ("training.parquet, other.parquet", "two of 41 s"),
-        ("multisine.npz", "41 s as arrays"),
-        ("drive.npy, readings.npy", f"one period of a drive, and {PERIODS} of readings, 10 kHz"),
-        ("recordings/x/", "a segment as the recorder of a service writes it"),
-    ]
-
-
-def _motion(duration_s: float, seed: int) -> FloatArray:
-    """(n,) voltages of many tones over the whole drive, 0 to 8 V: a model of part of it is wrong at rest."""
-    u_V = multitone(duration_s, DT_S, seed=seed)[1]
-    whole: FloatArray = 8.0 * (u_V - u_V.min()) / np.ptp(u_V)
-    return whole
 
 
 def _readings(u_V: FloatArray, dt_s: float = DT_S) -> FloatArray:
@@ -157,29 +147,16 @@ def _readings(u_V: FloatArray, dt_s: float = DT_S) -> FloatArray:
     return readings
 
 
-def _periodic(folder: Path) -> list[tuple[str, str]]:
+def _periodic(folder: Path) -> None:
     """Recordings for ``dehyst modes``: periods in steady state, realisations of orthogonal phases."""
     for name, rms_V, seed in (("low", 0.1, 1), ("high", 0.3, 2)):
         u_V, y_um = _steady(2, 512, 4, 2, rms_V, seed)
         np.savez(folder / f"{name}.npz", u=u_V, y_um=y_um, fs_hz=1.0 / DT_S)
-    for name, seed in (("train", 3), ("test", 4)):
-        u_V, y_um = _steady(2, 4096, 2, 2, 0.2, seed)
-        # Here the periods follow one another.
-        one_by_one = [np.concatenate([values[..., 0], values[..., 1]]) for values in (u_V, y_um)]
-        np.savez(folder / f"{name}.npz", u_V=one_by_one[0], y_um=one_by_one[1], dt_s=DT_S)
     u_V, y_um = _steady(3, 8192, 3, 3, 0.2, 5)
     for i, name in enumerate("abc"):
-        columns = [np.concatenate([*values[:, :, i].transpose(2, 0, 1)]) for values in (u_V, 1e3 * y_um)]
-        t_s = np.arange(len(columns[0])) * DT_S
-        np.savetxt(
-            folder / f"{name}.csv", np.column_stack([t_s, *columns]), delimiter=",", header="t_s,CH1,CH2,CH3,X,Y",
-            comments="", fmt="%.9g",
-        )  # fmt: skip
-    return [
-        ("low.npz, high.npz", "two drives and two outputs at two amplitudes, for 'dehyst modes'"),
-        ("train.npz, test.npz", "the same with the periods one after another"),
-        ("a.csv, b.csv, c.csv", "three drives and two outputs, a realisation each"),
-    ]
+        # Here the periods follow one another.
+        u, y_nm = (np.concatenate([*values[:, :, i].transpose(2, 0, 1)]) for values in (u_V, 1e3 * y_um))
+        _write(folder / f"{name}.csv", "t_s,CH1,CH2,CH3,X,Y", np.arange(len(u)) * DT_S, u, y_nm)
 
 
 def _steady(

@@ -117,33 +117,40 @@ RING_SIZE: Final = 32_768
 MAX_MESSAGE: Final = 4096
 
 
+#: Sample numbers, times, s, voltages, V, and readings, µm: (n,) each.
+Rows = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+
+
 class SampleRing:
     """The last `RING_SIZE` samples, written by the loop and sent by another thread.
 
-    ``put`` sends one message: (n,) numbers, times, s, voltages, V, and readings, µm. Samples that wait for longer than
-    the ring lasts, or that it cannot send, are lost and counted.
+    ``put`` sends one message. Samples that wait for longer than the ring lasts, or that it cannot send, are lost and
+    counted. ``changed`` gives the messages that are sent in place of one, ``rest`` those that it held back at the end.
     """
 
-    def __init__(self, put: Callable[[NDArray[np.int64], FloatArray, FloatArray, FloatArray], None]) -> None:
+    def __init__(
+        self, put: Callable[..., None], changed: Callable[[Rows], list[Rows]] = lambda rows: [rows],
+        rest: Callable[[], list[Rows]] = list,
+    ) -> None:  # fmt: skip
         self.written = self.published = self.lost = 0
-        self._put = put
-        self._seq = np.zeros(RING_SIZE, dtype=np.int64)
-        self._t_s, self._u_V, self._y_um = np.zeros(RING_SIZE), np.zeros(RING_SIZE), np.zeros(RING_SIZE)
+        self._put, self._changed, self._rest = put, changed, rest
+        self._columns: Rows = (np.zeros(RING_SIZE, dtype=np.int64), *np.zeros((3, RING_SIZE)))
         self._sent = 0
 
     def write(self, seq: int, t_s: float, u_V: float, y_um: float) -> None:
         """Write a sample; numbers rise."""
         slot = self.written % RING_SIZE
-        self._seq[slot], self._t_s[slot], self._u_V[slot], self._y_um[slot] = seq, t_s, u_V, y_um
+        for column, value in zip(self._columns, (seq, t_s, u_V, y_um), strict=True):
+            column[slot] = value
         self.written += 1
 
     def since(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
         """(numbers, V, µm), (n,) each, of the samples from number ``seq`` on, as far as kept. For the loop's thread."""
-        first = self.written
-        while first > max(self.written - RING_SIZE, 0) and self._seq[(first - 1) % RING_SIZE] >= seq:
+        first, numbers = self.written, self._columns[0]
+        while first > max(self.written - RING_SIZE, 0) and numbers[(first - 1) % RING_SIZE] >= seq:
             first -= 1
-        slots = np.arange(first, self.written) % RING_SIZE
-        return self._seq[slots], self._u_V[slots], self._y_um[slots]
+        numbers, _, u_V, y_um = self._rows(first, self.written)
+        return numbers, u_V, y_um
 
     def send(self) -> bool:
         """Send what waits, at most `MAX_MESSAGE` samples in one message. Returns whether more is left."""
@@ -153,23 +160,26 @@ class SampleRing:
         first = self._sent + lost
         self.lost += lost
         self._sent = min(end, first + MAX_MESSAGE)
-        if self._sent == first:
-            return False
-        slots = np.arange(first, self._sent) % RING_SIZE
-        self.deliver(self._seq[slots], self._t_s[slots], self._u_V[slots], self._y_um[slots])
+        if self._sent > first:
+            self._deliver(self._changed(self._rows(first, self._sent)))
         return self._sent < end
 
-    def deliver(self, seq: NDArray[np.int64], t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
-        """Send one message."""
-        try:
-            self._put(seq, t_s, u_V, y_um)
-        except zenoh.ZError:
-            self.lost += len(seq)
-        else:
-            self.published += len(seq)
-
     def finish(self) -> None:
-        """Called once, after the last ``send``."""
+        """Send what was held back; after the last ``send``."""
+        self._deliver(self._rest())
+
+    def _rows(self, first: int, stop: int) -> Rows:
+        slots, (seq, t_s, u_V, y_um) = np.arange(first, stop) % RING_SIZE, self._columns
+        return seq[slots], t_s[slots], u_V[slots], y_um[slots]
+
+    def _deliver(self, messages: list[Rows]) -> None:
+        for rows in messages:
+            try:
+                self._put(*rows)
+            except zenoh.ZError:
+                self.lost += len(rows[0])
+            else:
+                self.published += len(rows[0])
 
 
 class Sender:

@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
-from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.samples import MAX_SEQ
+from dehyst.service.stage_node.exchange import Rows
 
 #: Faults of a reading, and the meaning of ``value``.
 READING: Final = {
@@ -53,8 +52,6 @@ _SAYS: Final[dict[str, Callable[[FloatArray, FloatArray], tuple[FloatArray, Floa
     "u_sign": lambda u_V, y_um: (-u_V, y_um),
 }
 CHANGE: Final = "change"
-#: Faults in which the sensor goes on from its last reading.
-_ABOUT_LAST: Final = ("stuck_noisy", "sensor_gain", "sign")
 SPIKE_EVERY: Final = 25
 #: Motion of another stage: tones, Hz, their shares of its range, and its noise as a share.
 _OTHER_HZ: Final = (0.7, 1.9, 4.3)
@@ -62,9 +59,6 @@ _OTHER_SHARES: Final = (0.28, 0.12, 0.06)
 _OTHER_NOISE: Final = 1e-4
 MAX_DURATION_S: Final = 3600.0
 _EXPECTED: Final = 'an object such as {"fault": "nan", "duration_s": 1}'
-
-#: (seq, t_s, u_V, y_um), each (n,).
-Rows = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
 
 
 def sound_key(stage: str, axis: str) -> str:
@@ -118,11 +112,17 @@ def _number(field: str, value: Any) -> float:
     raise FieldError(field, repr(value)[:80], "a finite number")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Active:
-    fault: Fault
+    """A fault that has begun, from sample ``first`` to before ``stop``; the shown and the true reading at its begin."""
+
+    kind: str
+    value: float
     first: int
     stop: int
+    shown_um: float = math.nan
+    true_um: float = math.nan
+    done: bool = False
 
 
 class Injector:
@@ -135,7 +135,7 @@ class Injector:
     """
 
     def __init__(self, dt_s: float, apply: Callable[[dict[str, float]], None]) -> None:
-        self.counts = {kind: 0 for kind in (*READING, *DELIVERY, CHANGE, "refused")}
+        self.counts = dict.fromkeys((*READING, *DELIVERY, CHANGE, "refused"), 0)
         self.error = ""
         self._dt_s = dt_s
         self._apply = apply
@@ -143,11 +143,8 @@ class Injector:
         self._waiting: list[Fault] = []
         #: Always replaced as a whole, so that the sender reads it without the lock.
         self._active: tuple[_Active, ...] = ()
-        self._frozen_um = math.nan
-        self._about_um = math.nan
         self._last_um = 0.0
         self._held: Rows | None = None
-        self._jumped: _Active | None = None
         self._rng = np.random.default_rng(0)
         self._loss_rng = np.random.default_rng(1)
 
@@ -156,8 +153,7 @@ class Injector:
         try:
             self.add(decode_fault(payload))
         except InputError as error:
-            self.counts["refused"] += 1
-            self.error = str(error)
+            self._refuse(error)
 
     def add(self, fault: Fault) -> None:
         """Apply ``fault`` from the next tick on."""
@@ -169,86 +165,78 @@ class Injector:
         if self._waiting:
             self._begin(k)
         for active in self._active:
-            if not active.first <= k < active.stop:
+            if not active.first <= k < active.stop or active.kind not in READING:
                 continue
-            kind, value = active.fault.kind, active.fault.value
-            if kind == "nan":
-                y_um = math.nan
-            elif kind == "freeze":
-                # The last reading before the fault began.
-                y_um = self._last_um if k == active.first else self._frozen_um
-                self._frozen_um = y_um
-            elif kind == "spike" and (k - active.first) % SPIKE_EVERY == 0:
-                y_um += value
-            elif kind == "saturate":
-                y_um = min(y_um, value)
-            elif kind == "offset":
-                y_um += value
-            elif kind in _ABOUT_LAST:
-                if k == active.first:
-                    self._frozen_um, self._about_um = self._last_um, y_um
-                y_um = self._frozen_um + self._motion_um(kind, value, y_um - self._about_um)
-            elif kind == "other_stage":
-                y_um = self._other_um(k - active.first, value)
-            else:
-                continue
-            self.counts[kind] += 1
+            if k == active.first:
+                active.shown_um, active.true_um = self._last_um, y_um
+            if active.kind != "spike" or (k - active.first) % SPIKE_EVERY == 0:
+                y_um = self._read_um(active, k - active.first, y_um)
+                self.counts[active.kind] += 1
         self._last_um = y_um
         return y_um
 
-    def _motion_um(self, kind: str, value: float, moved_um: float) -> float:
-        """What a faulty sensor shows of a motion since the fault began, µm."""
-        if kind == "stuck_noisy":
-            return value * float(self._rng.standard_normal())
-        return value * moved_um if kind == "sensor_gain" else -moved_um
-
-    def _other_um(self, tick: int, range_um: float) -> float:
-        """The reading of another stage, µm, which moves in the middle of 0 to ``range_um``."""
-        t_s = tick * self._dt_s
-        share = 0.5 + _OTHER_NOISE * float(self._rng.standard_normal())
-        for hertz, part in zip(_OTHER_HZ, _OTHER_SHARES, strict=True):
-            share += part * math.sin(2.0 * math.pi * hertz * t_s + hertz)
-        return share * range_um
+    def _read_um(self, active: _Active, tick: int, y_um: float) -> float:
+        """What a faulty sensor shows of ``y_um``."""
+        value, moved_um = active.value, y_um - active.true_um
+        match active.kind:
+            case "nan":
+                return math.nan
+            case "freeze":
+                return active.shown_um
+            case "saturate":
+                return min(y_um, value)
+            case "stuck_noisy":
+                return active.shown_um + value * float(self._rng.standard_normal())
+            case "sensor_gain":
+                return active.shown_um + value * moved_um
+            case "sign":
+                return active.shown_um - moved_um
+            case "other_stage":
+                share = 0.5 + _OTHER_NOISE * float(self._rng.standard_normal())
+                for hertz, part in zip(_OTHER_HZ, _OTHER_SHARES, strict=True):
+                    share += part * math.sin(2.0 * math.pi * hertz * tick * self._dt_s + hertz)
+                return share * value
+        return y_um + value
 
     def deliver(self, rows: Rows) -> list[Rows]:
         """The messages that are sent in place of one message ``rows``. Called by the sender, in order."""
-        sent = [rows]
-        reordering = False
+        sent, reordering = [rows], False
         for active in self._active:
-            kind = active.fault.kind
             hit = (rows[0] >= active.first) & (rows[0] < active.stop)
-            n = int(np.count_nonzero(hit))
-            if kind not in DELIVERY or not n:
-                continue
-            self.counts[kind] += n
-            if kind == "gap":
-                sent = [(r[0][~hit], r[1][~hit], r[2][~hit], r[3][~hit]) for r in sent]
-            elif kind == "duplicate":
-                sent = [*sent, *sent]
-            elif kind == "clock":
-                sent = [(r[0], r[1] + active.fault.value * hit, r[2], r[3]) for r in sent]
-            elif kind in _SAYS:
-                sent = [(*r[:2], *np.where(hit, _SAYS[kind](r[2], r[3]), r[2:])) for r in sent]
-            elif kind == "losses":
-                kept = ~hit | (self._loss_rng.uniform(size=hit.size) >= active.fault.value)
-                self.counts[kind] -= int(np.count_nonzero(kept & hit))
-                left = rows[0][kept]
-                sent = [tuple(column[np.isin(r[0], left)] for column in r) for r in sent]  # type: ignore[misc]
-            elif kind == "seq_jump":
-                self.counts[kind] -= n
-                if self._jumped is not active:
-                    self._jumped = active
-                    self.counts[kind] += 1
-                    number = int(rows[0][hit][0])
-                    stray = min(number + int(active.fault.value), MAX_SEQ)
-                    sent = [(np.where(r[0] == number, stray, r[0]), *r[1:]) for r in sent]
-            else:
-                reordering = True
+            if active.kind in DELIVERY and hit.any():
+                self.counts[active.kind] += int(np.count_nonzero(hit))
+                reordering = reordering or active.kind == "reorder"
+                sent = [message for one in sent for message in self._delivered(active, one)]
         if self._held is not None:
             sent, self._held = [*sent, self._held], None
         elif reordering and len(sent) == 1:
             self._held, sent = sent[0], []
-        return [r for r in sent if r[0].size]
+        return [message for message in sent if message[0].size]
+
+    def _delivered(self, active: _Active, rows: Rows) -> list[Rows]:
+        """What a fault makes of one message, but for the order."""
+        seq, t_s, u_V, y_um = rows
+        hit = (seq >= active.first) & (seq < active.stop)
+        match active.kind:
+            case "gap":
+                return [(seq[~hit], t_s[~hit], u_V[~hit], y_um[~hit])]
+            case "duplicate":
+                return [rows, rows]
+            case "clock":
+                return [(seq, t_s + active.value * hit, u_V, y_um)]
+            case "losses":
+                kept = ~hit | (self._loss_rng.uniform(size=hit.size) >= active.value)
+                self.counts["losses"] -= int(np.count_nonzero(kept & hit))
+                return [(seq[kept], t_s[kept], u_V[kept], y_um[kept])]
+            case "seq_jump":
+                jumps = hit & (np.cumsum(hit) == 1) & (not active.done)
+                self.counts["seq_jump"] -= int(np.count_nonzero(hit & ~jumps))
+                active.done = True
+                stray = np.minimum(seq + int(active.value), MAX_SEQ)
+                return [(np.where(jumps, stray, seq), t_s, u_V, y_um)]
+            case kind if kind in _SAYS:
+                return [(seq, t_s, *np.where(hit, _SAYS[kind](u_V, y_um), (u_V, y_um)))]
+        return [rows]
 
     def flush(self) -> list[Rows]:
         """The message that is still held back, at the end."""
@@ -261,13 +249,17 @@ class Injector:
         # Keep past faults for a while: the sender may be behind the loop by the length of its ring.
         active = [a for a in self._active if a.stop > k - 65_536]
         for fault in waiting:
-            if fault.kind == CHANGE:
-                try:
-                    self._apply(dict(fault.values))
-                    self.counts[CHANGE] += 1
-                except InputError as error:
-                    self.counts["refused"] += 1
-                    self.error = str(error)
+            if fault.kind != CHANGE:
+                stop = k + max(1, round(fault.duration_s / self._dt_s))
+                active.append(_Active(fault.kind, fault.value, k, stop))
                 continue
-            active.append(_Active(fault, k, k + max(1, round(fault.duration_s / self._dt_s))))
+            try:
+                self._apply(dict(fault.values))
+                self.counts[CHANGE] += 1
+            except InputError as error:
+                self._refuse(error)
         self._active = tuple(active)
+
+    def _refuse(self, error: InputError) -> None:
+        self.counts["refused"] += 1
+        self.error = str(error)

@@ -20,11 +20,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import zenoh
 
 from dehyst.service.answers.guard import limit_voltage
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import Keys
@@ -39,9 +40,6 @@ from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.stage import Stage
 
 # --- The node.
-
-#: Longest wait of the clock for a voltage, s.
-MAX_LOCK_STEP_S = 60.0
 
 # --- One axis on the wire
 
@@ -76,14 +74,14 @@ class NodeConfig:
     stage: StageConfig
     name: str
     units: tuple[str, ...]
-    batch: int = 1
-    ticks: int | None = None
+    batch: Annotated[int, Setting(low=1, high=10_000)] = 1
+    ticks: Annotated[int | None, Setting(low=1)] = None
     free_run: bool = False
     second: str = ""
     inject: bool = False
     first: int = 0
     slew_V_per_s: float = math.inf
-    lock_step_s: float = 0.0
+    lock_step_s: Annotated[float, Setting(unit="s", low=0.0, high=60.0)] = 0.0
 
     def __post_init__(self) -> None:
         if not self.units or len(set(self.units)) < len(self.units):
@@ -96,36 +94,10 @@ class NodeConfig:
                 raise FieldError("second", self.second, "another name than those of the units")
             if self.stage.second_axis is None:
                 raise FieldError("second", self.second, f"nothing: stage {self.stage.name!r} has one axis")
-        if not 1 <= self.batch <= 10_000:
-            raise FieldError("batch", self.batch, "1 to 10000 samples a message")
+        check_bounds(self)
         check_seq("first", self.first)
         if not self.slew_V_per_s > 0.0:
             raise FieldError("slew_V_per_s", self.slew_V_per_s, "a positive limit in V/s")
-        if not 0.0 <= self.lock_step_s <= MAX_LOCK_STEP_S:
-            raise FieldError("lock_step_s", self.lock_step_s, f"0 to {MAX_LOCK_STEP_S:g} s")
-        if self.ticks is not None and self.ticks < 1:
-            raise FieldError("ticks", self.ticks, "at least 1")
-
-
-class FaultyRing(SampleRing):
-    """A ring whose messages an injector may change.
-
-    Samples that it leaves out count neither as published nor as lost; samples that it sends twice count twice.
-    """
-
-    def __init__(self, put: Callable[..., None], injector: Injector) -> None:
-        super().__init__(put)
-        self._injector = injector
-
-    def deliver(self, *rows: Any) -> None:
-        """Send what the faults make of one message."""
-        for message in self._injector.deliver(rows):
-            super().deliver(*message)
-
-    def finish(self) -> None:
-        """Send what a fault holds back."""
-        for message in self._injector.flush():
-            super().deliver(*message)
 
 
 class AxisPort:
@@ -155,10 +127,10 @@ class AxisPort:
         self.status = session.declare_publisher(status_key(config.name, axis))
         self.gate = CommandGate(session, keys, by, self.commands.receive)
         self._declared: list[Any] = [self.gate, publisher, self.status]
-        self.ring = SampleRing(put) if self.injector is None else FaultyRing(put, self.injector)
-        self.rings = [self.ring]
+        self.rings = [SampleRing(put)]
         if self.injector is not None:
             receive = self.injector.receive
+            self.rings = [SampleRing(put, self.injector.deliver, self.injector.flush)]
             sound = session.declare_publisher(sound_key(config.name, axis), express=True)
             self.rings.append(SampleRing(lambda *rows: sound.put(wire.encode_samples(*rows))))
             faults = session.declare_subscriber(fault_key(config.name, axis), lambda s: receive(s.payload.to_bytes()))
@@ -172,15 +144,15 @@ class AxisPort:
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""
-        t_s = k * self._dt_s
-        self.ring.write(k, t_s, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
-        for sound in self.rings[1:]:
-            sound.write(k, t_s, u_V, y_um)
+        ring, *sound = self.rings
+        ring.write(k, k * self._dt_s, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+        for other in sound:
+            other.write(k, k * self._dt_s, u_V, y_um)
 
     def summary(self) -> dict[str, Any]:
         summary: dict[str, Any] = {
-            "published": self.ring.published,
-            "lost": self.ring.lost,
+            "published": self.rings[0].published,
+            "lost": self.rings[0].lost,
             "slew_limited": self.limited,
             "commands": dict(self.commands.counts),
             "command": self.gate.to_json(),
@@ -213,14 +185,11 @@ class _Unit:
 
     def step(self, k: int) -> None:
         """Read, then apply. The sample holds the voltage that the stage really gets."""
-        if len(self.ports) == 1:
-            port = self.ports[0]
-            u_V = port.take(k)
-            port.write(k, u_V, self.stage.step(self.state, u_V)[0])
-            return
-        u_V, u2_V = (port.take(k) for port in self.ports)
-        for port, applied, y_um in zip(self.ports, (u_V, u2_V), self.stage.step(self.state, u_V, u2_V), strict=True):
-            port.write(k, applied, y_um)
+        applied_V = [port.take(k) for port in self.ports]
+        # Of a stage with two axes of which one is driven, the other reading goes nowhere.
+        readings_um = self.stage.step(self.state, *applied_V)
+        for port, u_V, y_um in zip(self.ports, applied_V, readings_um, strict=False):
+            port.write(k, u_V, y_um)
 
 
 class StageNode:
@@ -247,13 +216,10 @@ class StageNode:
 
     def summary(self) -> dict[str, Any]:
         """Ticks, late ticks, and per unit the counts of samples and commands so far."""
-        units = {port.axis: port.summary() for port in self._ports}
-        return {
-            "stage": self.config.name,
-            "dt_s": self.config.stage.dt_s,
-            **self._counts,
-            "units": units,
-        }
+        return {**self._common(), "units": {port.axis: port.summary() for port in self._ports}}
+
+    def _common(self) -> dict[str, Any]:
+        return {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
 
     def run(self, started: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Wait for the first commands of every unit (not in free run), then tick until the end or a stop.
@@ -307,6 +273,10 @@ class StageNode:
         k, late = first, 0
         worst_s = waited_s = 0.0
         now, wake = time.perf_counter, self._sender.wake
+
+        def count() -> None:
+            self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+
         start = now()
         while k < stop and not self._stop:
             due = start + waited_s + (k - first) * dt_s
@@ -314,8 +284,7 @@ class StageNode:
             if rest > 0.0:
                 time.sleep(rest)
             behind = now() - due
-            if behind > dt_s:
-                late += 1
+            late += behind > dt_s
             worst_s = max(worst_s, behind)
             if self.config.lock_step_s:
                 waited_s += self._wait_for_voltages(k)
@@ -323,11 +292,11 @@ class StageNode:
                 unit.step(k)
             k += 1
             if k % status_ticks == 0:
-                self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+                count()
                 wake(status=True)
             elif k % batch == 0:
                 wake()
-        self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+        count()
         self._counts["ran_s"] = now() - start
 
     def _wait_for_voltages(self, k: int) -> float:
@@ -339,8 +308,7 @@ class StageNode:
         return time.perf_counter() - begin
 
     def _publish_status(self) -> None:
-        common = {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
         for port in self._ports:
             # A lost status is followed by another.
             with contextlib.suppress(zenoh.ZError):
-                port.status.put(json.dumps({**common, "axis": port.axis, **port.summary()}))
+                port.status.put(json.dumps({**self._common(), "axis": port.axis, **port.summary()}))

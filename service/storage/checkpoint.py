@@ -23,14 +23,7 @@ from dehyst.adaptive.state import Entry, load
 from dehyst.adaptive.types import OnlineModel, StateDict, joined, under
 from dehyst.service.intake.sample_queue import SampleQueue
 from dehyst.service.operating.server import Switch
-from dehyst.service.protocol.container import (
-    MAX_HEADER_BYTES,
-    UNITS,
-    decode_body,
-    decode_header,
-    encode_body,
-    split_state,
-)
+from dehyst.service.protocol import container
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
@@ -65,7 +58,7 @@ class CheckpointMeta:
     models: Annotated[dict[str, str], Entry("digests of the models in the model file that it grew from")] = field(
         default_factory=dict
     )
-    units: Annotated[dict[str, str], Entry("those of the model file")] = field(default_factory=lambda: dict(UNITS))
+    units: Annotated[dict[str, str], Entry("those of the model file")] = field(default_factory=container.UNITS.copy)
 
     @classmethod
     def of(cls, header: Mapping[str, Any]) -> CheckpointMeta:
@@ -84,7 +77,7 @@ class CheckpointMeta:
             ("stage", self.stage, stage),
             ("axis", self.axis, axis),
             ("sample time", self.dt_s, dt_s),
-            ("units", self.units, UNITS),
+            ("units", self.units, container.UNITS),
         ):
             if got != wanted:
                 raise ModelFileError(f"{name} is {got!r}, expected {wanted!r}")
@@ -99,8 +92,8 @@ class CheckpointMeta:
 
 def encode_checkpoint(meta: CheckpointMeta, state: StateDict) -> list[Any]:
     """The bytes of a checkpoint as buffers in order; arrays are not copied."""
-    values, arrays = split_state(state)
-    body = encode_body({"meta": asdict(meta), "values": values}, arrays)
+    values, arrays = container.split_state(state)
+    body = container.encode_body({"meta": asdict(meta), "values": values}, arrays)
     digest = hashlib.blake2b(digest_size=16)
     for buffer in body:
         digest.update(buffer)
@@ -118,7 +111,7 @@ def decode_checkpoint(data: bytes) -> tuple[CheckpointMeta, StateDict]:
     if length > len(body) or hashlib.blake2b(body, digest_size=16).digest() != digest:
         raise ModelFileError("damaged or cut off: its digest does not match")
     try:
-        header, arrays = decode_body(body, length, len(body))
+        header, arrays = container.decode_body(body, length, len(body))
         return CheckpointMeta.of(header), dict(header["values"]) | arrays
     except (ValueError, KeyError, TypeError) as error:
         raise ModelFileError(f"its header is not valid: {error!r}") from error
@@ -141,20 +134,17 @@ class CheckpointFolder:
         #: Until when checkpoints are kept, by their number, by ``time.monotonic``, s.
         self._pinned: dict[int, float] = {}
 
-    def pin(self, now_s: float, long_s: float) -> None:
-        """Keep all that are kept at ``now_s`` (``time.monotonic``) for ``long_s`` more; a full disk still takes them.
+    def pin(self, now_s: float, until_s: float) -> frozenset[int]:
+        """Keep all that stay by their age at ``now_s`` until ``until_s`` (``time.monotonic``) at least; their numbers.
 
-        One that is there only because it was pinned before is not pinned again: who lists them all the time must not
-        keep them all.
+        A full disk still takes them. One that is there only because it was pinned before is not pinned again: who lists
+        them all the time must not keep them all.
         """
         numbers = self.numbers()
         kept = self._regular(max(numbers, default=0), numbers)
-        pinned = {number: until_s for number, until_s in self._pinned.items() if until_s > now_s}
-        self._pinned = pinned | dict.fromkeys(kept, now_s + long_s)
-
-    def is_safe(self, number: int, now_s: float, long_s: float) -> bool:
-        """Whether a checkpoint stays for ``long_s`` more at least, but for a full disk."""
-        return self._pinned.get(number, 0.0) >= now_s + long_s
+        pinned = {number: end_s for number, end_s in self._pinned.items() if end_s > now_s}
+        self._pinned = pinned | dict.fromkeys(kept, until_s)
+        return frozenset(kept)
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
         """Write a checkpoint under the next number, atomically and synced. Raises OSError."""
@@ -183,15 +173,8 @@ class CheckpointFolder:
         for path in reversed(self._paths()):
             with contextlib.suppress(OSError, ModelFileError):
                 meta = _read_meta(path)
-                found.append(
-                    {
-                        "checkpoint": number_of(path),
-                        "seq": meta.seq,
-                        "samples": meta.samples,
-                        "time_unix_s": meta.time_unix_s,
-                        "bytes": path.stat().st_size,
-                    }
-                )
+                told = {name: getattr(meta, name) for name in ("seq", "samples", "time_unix_s")}
+                found.append({"checkpoint": number_of(path), **told, "bytes": path.stat().st_size})
         return found
 
     def read(self, number: int) -> tuple[CheckpointMeta, StateDict]:
@@ -256,14 +239,11 @@ def number_of(path: Path) -> int:
 
 def _read_meta(path: Path) -> CheckpointMeta:
     with open(path, "rb") as file:
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size or head[: len(MAGIC)] != MAGIC:
-            raise ModelFileError("not a checkpoint")
-        length = _HEAD.unpack(head)[1]
-        if length > MAX_HEADER_BYTES:
+        magic, length, _ = _HEAD.unpack(file.read(_HEAD.size).ljust(_HEAD.size))
+        if magic != MAGIC or length > container.MAX_HEADER_BYTES:
             raise ModelFileError("not a checkpoint")
         try:
-            return CheckpointMeta.of(decode_header(file.read(length)))
+            return CheckpointMeta.of(container.decode_header(file.read(length)))
         except ValueError as error:
             raise ModelFileError(f"its header is not valid: {error}") from error
 
@@ -275,9 +255,8 @@ def _read_meta(path: Path) -> CheckpointMeta:
 
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
-#: Time, s, for which checkpoints are kept after they were listed; one that has less than half of it left is no longer
-#: listed.
-LISTED_S: Final = 600.0
+#: Time, s, for which checkpoints are kept after they were listed.
+LISTED_S: Final = 300.0
 _PORTION = 100
 
 
@@ -305,10 +284,10 @@ class CheckpointKeeper:
         self._closing = False
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
-        self._owner: FolderOwner | None = None
-        if folder is not None:
-            self._owner = FolderOwner(folder.directory, LOCK, f"{stage}/{axis.config.name}")
-        self._bytes = self._bytes_in_all = 0
+        self._owner = None if folder is None else FolderOwner(folder.directory, LOCK, f"{stage}/{axis.config.name}")
+        self._bytes = 0
+        #: Bytes of all checkpoints that were written.
+        self.bytes_in_all = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
@@ -325,22 +304,25 @@ class CheckpointKeeper:
     def on_snapshot(self) -> None:
         """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
         now_s = self._clock()
-        if self.folder is not None and now_s >= self._due_at_s:
+        if now_s >= self._due_at_s:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
-            self._copy()
+            self.copy_now()
 
     def keep_listed(self) -> frozenset[int]:
-        """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S` / 2."""
-        folder, now_s = self.folder, self._clock()
-        if folder is None:
-            return frozenset()
-        folder.pin(now_s, LISTED_S)
-        return frozenset(number for number in folder.numbers() if folder.is_safe(number, now_s, 0.5 * LISTED_S))
+        """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S`."""
+        now_s = self._clock()
+        return frozenset() if self.folder is None else self.folder.pin(now_s, now_s + LISTED_S)
 
     def copy_now(self) -> None:
         """Copy the present state, to be written. Call it in the thread that handles samples."""
-        if self.folder is not None:
-            self._copy()
+        if self.folder is None:
+            return
+        copied = (self._meta(), self._axis.state_dict())
+        with self._ready:
+            # Replaces a copy that has not been written yet.
+            self._copied = copied
+            self._copies += 1
+            self._ready.notify_all()
 
     def wait_written(self, timeout_s: float) -> bool:
         """Wait until the last copy, or a later one, is on the disk; False if it is not, or no checkpoints are kept."""
@@ -364,20 +346,14 @@ class CheckpointKeeper:
             return None
         at = self._written_at_s
         a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
-        age_s = None if at is None else time.monotonic() - at
-        refused = self.folder.refused
-        return {**self._counts, "refused": refused, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
-
-    @property
-    def bytes_in_all(self) -> int:
-        """Bytes of all checkpoints that were written."""
-        return self._bytes_in_all
+        ages = {"refused": self.folder.refused, "age_s": None if at is None else time.monotonic() - at}
+        return {**self._counts, **ages, "bytes": self._bytes, "bytes_per_day": a_day}
 
     def close(self) -> None:
         """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
         if self.folder is None:
             return
-        self._copy()
+        self.copy_now()
         with self._ready:
             self._closing = True
             self._ready.notify_all()
@@ -386,47 +362,34 @@ class CheckpointKeeper:
             self._owner.release()
 
     def _meta(self) -> CheckpointMeta:
-        stage, name, instance = self._names
-        axis = self._axis
+        (stage, name, instance), axis = self._names, self._axis
         seq, samples, unix_s = axis.handled_seq, axis.sequence.received, time.time()
         return CheckpointMeta(stage, name, axis.dt_s, seq, samples, unix_s, instance, models=axis.identified)
-
-    def _copy(self) -> None:
-        meta = self._meta()
-        copied = (meta, self._axis.state_dict())
-        with self._ready:
-            # Replaces a copy that has not been written yet.
-            self._copied = copied
-            self._copies += 1
-            self._ready.notify_all()
 
     def _run(self) -> None:
         assert self.folder is not None
         assert self._owner is not None
         while True:
             with self._ready:
-                while self._copied is None and not self._closing:
-                    self._ready.wait()
+                self._ready.wait_for(lambda: self._copied is not None or self._closing)
                 if self._copied is None:
                     return
                 (meta, state), self._copied = self._copied, None
                 copy = self._copies
-            written = False
+            on_disk = self._on_disk
             try:
                 self._owner.take()
                 self._bytes = self.folder.write(meta, state).stat().st_size
-                self._bytes_in_all += self._bytes
+                self.bytes_in_all += self._bytes
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
-                self._written_at_s = time.monotonic()
-                written = True
+                self._written_at_s, on_disk = time.monotonic(), copy
             except (OSError, DehystError, ValueError) as error:
                 words = (isinstance(error, OSError) and error.strerror) or str(error)
                 if not self._counts["degraded"]:
                     self._axis.note("checkpoint_failed", f"{words}; tried again")
                 self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
             with self._ready:
-                self._tried = copy
-                self._on_disk = copy if written else self._on_disk
+                self._tried, self._on_disk = copy, on_disk
                 self._ready.notify_all()
 
 
@@ -470,20 +433,20 @@ def learn_again(axis: Axis, recordings: Path | None, switch: Switch | None = Non
     recorded a second time.
     """
     begun = axis.sequence.received
-    rows = None if recordings is None else rows_behind(recordings, begun, axis.owner)
-    count = 0 if rows is None else len(rows)
+    samples = None if recordings is None else rows_behind(recordings, begun, axis.owner)
+    count = 0 if samples is None else len(samples)
     first = max(0, count - _MOST_AGAIN)
     at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)
     start = first
-    while rows is not None and start < count:
+    while samples is not None and start < count:
         if start == at and switch is not None:
             axis.set_frozen(switch.freezes, switch.who)
         stop = min(start + _PORTION, count, at if start < at else count)
-        part = rows.part(start, stop)
-        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
+        part = slice(start, stop)
+        axis.handle(SampleBatch(samples.seq[part], samples.t_s[part], samples.u_V[part], samples.y_um[part]))
         start = stop
     if switch is not None and at >= count:
         axis.set_frozen(switch.freezes, switch.who)
-    if rows is not None:
+    if samples is not None:
         axis.note("learnt_again", f"{count - first} samples from the journal")
     return count - first

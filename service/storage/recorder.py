@@ -16,29 +16,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dehyst.service.background.job import BackgroundJob
-from dehyst.service.protocol.errors import FieldError
+from dehyst.service.config.schema import Setting, check_bounds
+from dehyst.service.storage import segments
 from dehyst.service.storage.owner import FolderOwner
-from dehyst.service.storage.segments import (
-    LOCK,
-    RECORD,
-    Journal,
-    Rows,
-    Syncer,
-    close_left_open,
-    closed_by,
-    closing,
-    journal_of,
-    left_open,
-    make_room,
-    next_number,
-    number_of,
-)
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"
@@ -46,6 +32,7 @@ ASIDE: Final = "_aside"
 _LOOK_S: Final = 0.2
 #: Fewest samples per segment: each costs a process that closes it.
 _LEAST_ROWS: Final = 1000
+_SOME, _TIME = Setting(low=1), Setting(unit="s", low=0, above=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,31 +55,25 @@ class RecorderConfig:
 
     directory: Path
     owner: str = ""
-    segment_rows: int = 600_000
-    max_bytes: int = 2_000_000_000
-    queue_samples: int = 100_000
-    flush_s: float = 0.03
-    sync_s: float = 5.0
-    retry_s: float = 5.0
+    segment_rows: Annotated[int, _SOME] = 600_000
+    max_bytes: Annotated[int, _SOME] = 2_000_000_000
+    queue_samples: Annotated[int, _SOME] = 100_000
+    flush_s: Annotated[float, _TIME] = 0.03
+    sync_s: Annotated[float, _TIME] = 5.0
+    retry_s: Annotated[float, _TIME] = 5.0
 
     def __post_init__(self) -> None:
-        for name, least in (("segment_rows", 1), ("max_bytes", 1), ("queue_samples", 1)):
-            value = getattr(self, name)
-            if value < least:
-                raise FieldError(name, value, f"a whole number of at least {least}")
-        for name in ("flush_s", "sync_s", "retry_s"):
-            if not getattr(self, name) > 0.0:
-                raise FieldError(name, getattr(self, name), "a positive time in s")
+        check_bounds(self)
 
     @property
     def rows(self) -> int:
         """Samples per segment: two journals, and what is made of one, fit into ``max_bytes``."""
-        return min(self.segment_rows, max(_LEAST_ROWS, self.max_bytes // (4 * RECORD.itemsize)))
+        return min(self.segment_rows, max(_LEAST_ROWS, self.max_bytes // (4 * segments.RECORD.itemsize)))
 
     @property
     def journal_bytes(self) -> int:
         """Size of a full journal."""
-        return self.rows * RECORD.itemsize
+        return self.rows * segments.RECORD.itemsize
 
     def aside(self) -> RecorderConfig:
         """Settings for samples that the axis does not handle: a folder inside this one, a tenth of its disk space."""
@@ -113,27 +94,26 @@ class Recorder:
 
     def __init__(self, config: RecorderConfig, index: int = 0, hold_s: float | None = None) -> None:
         self.config = config
-        self._folder = FolderOwner(config.directory, LOCK, config.owner)
+        self._folder = FolderOwner(config.directory, segments.LOCK, config.owner)
         if hold_s is not None:
             self._folder.hold("recorder", hold_s)
         self.index = index
-        self._queue: deque[tuple[int, Rows]] = deque()
+        self._queue: deque[segments.Rows] = deque()
         self._waiting = 0
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._stop = False
-        self._counts = {"offered": 0, "written": 0, "dropped": 0, "lost": 0, "errors": 0, "segments": 0, "removed": 0}
-        self._counts["bytes"] = 0
-        self._salvaged = 0
+        names = ("offered", "written", "dropped", "lost", "errors", "segments", "removed", "bytes", "salvaged")
+        self._counts = dict.fromkeys(names, 0)
         self._error = ""
-        self._segment: Journal | None = None
+        self._segment: segments.Journal | None = None
         # Whether there may be journals to close, and the number of the first one that is of this recorder.
         self._left_open, self._first = True, sys.maxsize
         self._closer: BackgroundJob | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
         self._not_before = self._told_until = self._look_at = 0.0
-        self._syncer = Syncer(config.sync_s)
+        self._syncer = segments.Syncer(config.sync_s)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -149,16 +129,15 @@ class Recorder:
         Returns False if they were dropped, because the queue is full or the recorder is closed. Raises InputError on
         unequal lengths.
         """
-        numbers = np.array(seq, dtype=np.int64).reshape(-1)
-        t, u, y = (np.array(c, dtype=np.float64).reshape(-1) for c in (t_s, u_V, y_um))
-        rows = Rows(numbers, t, u, y, [reason] * len(numbers) if isinstance(reason, str) else list(reason))
+        rows = segments.rows_of(seq, t_s, u_V, y_um, reason)
         with self._lock:
             self._counts["offered"] += len(rows)
-            first, self.index = self.index, self.index + len(rows)
+            rows["index"] = self.index + np.arange(len(rows))
+            self.index += len(rows)
             if self._stop or self._waiting + len(rows) > self.config.queue_samples:
                 self._counts["dropped"] += len(rows)
                 return False
-            self._queue.append((first, rows))
+            self._queue.append(rows)
             self._waiting += len(rows)
         # Wake the thread before its pause is over: a crash loses samples that are only in memory.
         self._wake.set()
@@ -185,14 +164,11 @@ class Recorder:
         ``degraded`` is True from a failure of the disk until the next batch is written.
         """
         with self._lock:
+            aside = 0 if self._aside is None else self._aside.counters()["written"]
             return {
-                **self._counts,
-                "salvaged": self._salvaged,
-                "waiting": self._waiting,
-                "aside": 0 if self._aside is None else self._aside.counters()["written"],
-                "degraded": bool(self._error),
-                "error": self._error,
-            }
+                **self._counts, "waiting": self._waiting, "aside": aside,
+                "degraded": bool(self._error), "error": self._error,
+            }  # fmt: skip
 
     def close(self, timeout_s: float = 10.0) -> bool:
         """Write the queue, close the segment, end the thread. Returns False if that takes longer than ``timeout_s``."""
@@ -215,48 +191,47 @@ class Recorder:
             self._wake.clear()
             stop = self._stop
             taken = self._take()
-            if taken is not None:
-                self._write(*taken)
+            if taken:
+                self._write(np.concatenate(taken))
             elif stop:
                 break
             self._look_after_closing()
             if not stop:
                 self._wake.wait(self.config.flush_s)
-        if self._segment is not None:
-            self._segment.close()
+        self._leave_segment()
         self._close_all()
         self._folder.release()
 
-    def _take(self) -> tuple[Rows, NDArray[np.int64]] | None:
+    def _take(self) -> list[segments.Rows]:
         with self._lock:
-            parts = list(self._queue)
+            taken = list(self._queue)
             self._queue.clear()
             self._waiting = 0
-        if not parts:
-            return None
-        index = np.concatenate([first + np.arange(len(rows)) for first, rows in parts])
-        return Rows.joined([rows for _, rows in parts]), index
+        return taken
 
     def _count(self, **more: int) -> None:
         with self._lock:
             for name, value in more.items():
                 self._counts[name] += value
 
-    def _failed(self, error: OSError) -> None:
-        self._not_before = time.monotonic() + self.config.retry_s
+    def _failed(self, why: str) -> None:
         with self._lock:
             self._counts["errors"] += 1
-            self._error = f"{error.strerror or error}"
+            self._error = why
 
-    def _begin_segment(self) -> Journal:
+    def _pause(self, error: OSError) -> None:
+        self._not_before = time.monotonic() + self.config.retry_s
+        self._failed(error.strerror or str(error))
+
+    def _begin_segment(self) -> segments.Journal:
         directory = self.config.directory
         self._folder.take()
-        self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
-        number = next_number(directory)
+        self._count(removed=segments.make_room(directory, self.config.max_bytes, self.config.journal_bytes))
+        number = segments.next_number(directory)
         self._first = min(self._first, number)
-        return Journal(journal_of(directory, number))
+        return segments.Journal(segments.journal_of(directory, number))
 
-    def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
+    def _write(self, rows: segments.Rows) -> None:
         # After a failure: pause, except at the end, where one more attempt costs nothing.
         if time.monotonic() < self._not_before and not self._stop:
             self._count(lost=len(rows))
@@ -268,24 +243,26 @@ class Recorder:
                 if self._segment is None:
                     self._segment = self._begin_segment()
                 stop = min(len(rows), done + self.config.rows - self._segment.rows)
-                written = self._segment.write(rows.part(done, stop), index[done:stop])
+                written = self._segment.write(rows[done:stop])
                 self._count(written=stop - done, bytes=written)
                 done = stop
                 if self._segment.rows >= self.config.rows:
-                    self._segment.close()
-                    self._segment, self._left_open = None, True
+                    self._leave_segment()
             if self._segment is not None:
                 self._syncer.look(self._segment)
             if time.monotonic() >= max(self._not_before, self._told_until):
                 with self._lock:
                     self._error = ""
         except OSError as error:
-            self._failed(error)
+            self._pause(error)
             self._count(lost=len(rows) - done)
-            if self._segment is not None:
-                # The rows in this journal are converted to Parquet later.
-                self._segment.close()
-                self._segment, self._left_open = None, True
+            self._leave_segment()
+
+    def _leave_segment(self) -> None:
+        """Close the open journal; its rows are converted to Parquet later."""
+        if self._segment is not None:
+            self._segment.close()
+            self._segment, self._left_open = None, True
 
     def _look_for_folder(self) -> None:
         """Begin anew where the folder was removed or renamed; the recording is degraded for a while, but goes on."""
@@ -293,47 +270,43 @@ class Recorder:
         if self._segment is None or now < self._look_at:
             return
         self._look_at = now + _LOOK_S
-        if not self._segment.vanished:
-            return
-        self._segment.close()
-        self._segment = None
-        self._told_until = now + self.config.retry_s
-        with self._lock:
-            self._counts["errors"] += 1
-            self._error = f"{self.config.directory} vanished while it was recorded into; it is made anew"
+        if self._segment.vanished:
+            self._leave_segment()
+            self._told_until = now + self.config.retry_s
+            self._failed(f"{self.config.directory} vanished while it was recorded into; it is made anew")
 
     def _look_after_closing(self) -> None:
         """Convert the journals that are full, or that a crash or a failing disk left."""
         closer = self._closer
         if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
             self._left_open = False
-            self._closer = closing(self.config.directory, self._segment.path)
+            self._closer = segments.closing(self.config.directory, self._segment.path)
         elif closer is not None and not closer.running:
             self._closer = None
-            self._take_result(lambda: closed_by(closer))
+            self._take_result(lambda: segments.closed_by(closer))
 
     def _take_result(self, closed: Callable[[], list[Path]]) -> None:
         """``closed`` : returns the segments that were closed; raises OSError."""
         try:
             made = closed()
-            own = sum(number_of(path) >= self._first for path in made)
-            self._count(bytes=sum(path.stat().st_size for path in made), segments=own)
-            self._salvaged += len(made) - own
-            self._count(removed=make_room(self.config.directory, self.config.max_bytes))
+            own = sum(segments.number_of(path) >= self._first for path in made)
+            written = sum(path.stat().st_size for path in made)
+            removed = segments.make_room(self.config.directory, self.config.max_bytes)
+            self._count(bytes=written, segments=own, salvaged=len(made) - own, removed=removed)
         except OSError as error:
             self._left_open = True
-            self._failed(error)
+            self._pause(error)
 
     def _close_all(self) -> None:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
         if self._closer is not None:
             self._closer.cancel()
-        if not left_open(self.config.directory):
+        if not segments.left_open(self.config.directory):
             return
 
         def closed() -> list[Path]:
             # One that has recorded nothing holds no folder yet, and leaves another's alone.
             self._folder.take()
-            return close_left_open(self.config.directory)
+            return segments.close_left_open(self.config.directory)
 
         self._take_result(closed)

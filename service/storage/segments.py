@@ -16,17 +16,15 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from dehyst.adaptive.types import FloatArray
 from dehyst.service.background.job import BackgroundJob, run_worker
 from dehyst.service.protocol.errors import FieldError
+from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.storage.output import PART, atomic_write
 from dehyst.service.storage.owner import is_still_at, owner_of
 
@@ -50,40 +48,21 @@ _WORD_BYTES: Final = 24
 INDEX_MODULUS: Final = 2**32
 
 
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """n samples as recorded; ``reason`` of each is ``learnt``, or the gate that refused it."""
+#: n samples in memory; ``reason`` of each is ``learnt``, or the gate that refused it.
+ROWS: Final = np.dtype(
+    [("seq", "i8"), ("t_s", "f8"), ("u_V", "f8"), ("y_um", "f8"), ("index", "i8"), ("reason", "U24")]
+)
+Rows = NDArray[np.void]
 
-    seq: NDArray[np.int64]
-    t_s: FloatArray
-    u_V: FloatArray
-    y_um: FloatArray
-    reason: list[str]
 
-    def __post_init__(self) -> None:
-        n = len(self.seq)
-        for name in ("t_s", "u_V", "y_um", "reason"):
-            if len(getattr(self, name)) != n:
-                raise FieldError(name, f"{len(getattr(self, name))} values", f"{n}, as many as seq")
-
-    def __len__(self) -> int:
-        return len(self.seq)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Rows]) -> Rows:
-        """The rows of all ``parts``, in order; ``parts`` must not be empty."""
-        if len(parts) == 1:  # the usual case
-            return parts[0]
-        seq = np.concatenate([part.seq for part in parts])
-        t_s, u_V, y_um = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t_s", "u_V", "y_um"))
-        return cls(seq, t_s, u_V, y_um, [word for part in parts for word in part.reason])
-
-    def part(self, start: int, stop: int) -> Rows:
-        """Rows ``start`` to ``stop`` - 1."""
-        if start == 0 and stop == len(self):
-            return self
-        cut = slice(start, stop)
-        return Rows(self.seq[cut], self.t_s[cut], self.u_V[cut], self.y_um[cut], self.reason[cut])
+def rows_of(seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]) -> Rows:
+    """(n,) rows, copied; ``reason`` is one word for all or one for each. Raises FieldError on unequal lengths."""
+    rows = np.zeros(np.size(seq), dtype=ROWS)
+    for name, column in (("seq", seq), ("t_s", t_s), ("u_V", u_V), ("y_um", y_um), ("reason", reason)):
+        if name != "reason" and np.size(column) != rows.size:
+            raise FieldError(name, f"{np.size(column)} values", f"{rows.size}, as many as seq")
+        rows[name] = column
+    return rows
 
 
 class Journal:
@@ -103,22 +82,23 @@ class Journal:
             path.unlink(missing_ok=True)
             raise
 
-    def write(self, rows: Rows, index: NDArray[np.int64]) -> int:
-        """Append ``rows`` with the (n,) ``index`` of each: all of them or none. Returns the bytes that it wrote.
+    def write(self, rows: Rows) -> int:
+        """Append ``rows``: all of them or none. Returns the bytes that it wrote.
 
         The operating system has the rows when this returns, so a killed process does not lose them.
         """
-        words = dict(self._words)
-        new = [word for word in dict.fromkeys(rows.reason) if word not in words]
+        words, reasons = dict(self._words), rows["reason"].tolist()
+        new = [word for word in dict.fromkeys(reasons) if word not in words]
         for word in new:
             words[word] = len(words) % _WORD
         records = np.zeros(len(new) + len(rows), dtype=RECORD)
         for at, word in enumerate(new):
             records[at] = _definition(words[word], word)
         body = records[len(new) :]
-        body["seq"], body["t_s"], body["u_V"], body["y_um"] = rows.seq, rows.t_s, rows.u_V, rows.y_um
-        body["index"] = index % INDEX_MODULUS
-        body["reason"] = [words[word] for word in rows.reason]
+        for name in ("seq", "t_s", "u_V", "y_um"):
+            body[name] = rows[name]
+        body["index"] = rows["index"] % INDEX_MODULUS
+        body["reason"] = [words[word] for word in reasons]
         records["mark"] = _MARK
         self._put(records.tobytes())
         self._size += records.nbytes
@@ -191,8 +171,8 @@ def _definition(number: int, word: str) -> Any:
     return (number, *numbers, 0, _WORD, _MARK)
 
 
-def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
-    """(rows, (n,) index of each), up to the first incomplete record. Raises OSError if the disk fails."""
+def read_journal(path: Path) -> Rows:
+    """The rows up to the first incomplete record. Raises OSError if the disk fails."""
     data = path.read_bytes()
     if data[: len(HEADER)] != HEADER:
         data = HEADER
@@ -207,10 +187,10 @@ def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
         for record in records[definitions]
     }
     body = records[~definitions]
-    reason = [words.get(number, "unknown") for number in body["reason"].tolist()]
-    t_s, u_V, y_um = (body[name].astype(np.float64) for name in ("t_s", "u_V", "y_um"))
-    rows = Rows(body["seq"].astype(np.int64), t_s, u_V, y_um, reason)
-    return rows, body["index"].astype(np.int64)
+    reasons = [words.get(number, "unknown") for number in body["reason"].tolist()]
+    rows = rows_of(body["seq"], body["t_s"], body["u_V"], body["y_um"], reasons)
+    rows["index"] = body["index"]
+    return rows
 
 
 OPEN, CLOSED = ".journal", ".parquet"
@@ -224,12 +204,8 @@ HIDDEN: Final = "_"
 _CLOSING_S: Final = 3600.0
 
 
-def schema() -> Any:
-    """Columns of a segment: ``seq``, ``t_s``, ``u_V``, ``y_um``, and ``reason`` as text."""
-    import pyarrow as pa
-
-    numbers = [("t_s", pa.float64()), ("u_V", pa.float64()), ("y_um", pa.float64())]
-    return pa.schema([("seq", pa.int64()), *numbers, ("reason", pa.string())])
+#: Columns of a segment.
+COLUMNS: Final = ("seq", "t_s", "u_V", "y_um", "reason")
 
 
 def convert(journal: Path) -> Path | None:
@@ -237,7 +213,7 @@ def convert(journal: Path) -> Path | None:
 
     The journal is kept with the suffix ``.done``; a journal without rows is removed.
     """
-    rows, _ = read_journal(journal)
+    rows = read_journal(journal)
     if not len(rows):
         journal.unlink(missing_ok=True)
         return None
@@ -245,8 +221,7 @@ def convert(journal: Path) -> Path | None:
     from pyarrow import parquet
 
     target = journal.with_name(journal.name.removeprefix(HIDDEN)).with_suffix(CLOSED)
-    columns = [pa.array(column) for column in (rows.seq, rows.t_s, rows.u_V, rows.y_um)]
-    table = pa.table([*columns, pa.array(rows.reason, pa.string())], schema=schema())
+    table = pa.table([pa.array(rows[name].tolist() if name == "reason" else rows[name]) for name in COLUMNS], COLUMNS)
     with atomic_write(target) as file:
         parquet.write_table(table, file, compression="zstd", use_dictionary=["reason"])
     os.replace(journal, journal.with_suffix(DONE))
@@ -292,39 +267,27 @@ def _close(order: dict[str, Any], _: object) -> dict[str, Any]:
         return {"error": error.strerror or str(error)}
 
 
-def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
-    """The rows from the ``index``-th handled sample on, in the order of handling, up to the first missing one.
+def rows_behind(directory: Path, index: int, owner: str) -> SampleBatch | None:
+    """The samples from the ``index``-th handled one on, in the order of handling, up to the first missing one.
 
     Returns None if the journals do not reach back to that sample, hold no later one, or are not those of ``owner``
     (see `FolderOwner`).
     """
     if owner_of(directory, LOCK) not in ("", owner):
         return None
-    columns: list[list[Any]] = [[] for _ in range(5)]
+    found = np.zeros(0, dtype=ROWS)
     for path in [*_sorted(directory, DONE), *_sorted(directory, OPEN)]:
-        try:
-            rows, numbers = read_journal(path)
-        except OSError:
-            continue
-        if not len(rows):  # killed right after it was opened
-            continue
-        # Position relative to ``index``; the stored count wraps around.
-        place = (numbers - index + INDEX_MODULUS // 2) % INDEX_MODULUS - INDEX_MODULUS // 2
-        starts = [0, *(np.nonzero(np.diff(place) != 1)[0] + 1).tolist()]
-        for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
-            have, at = len(columns[0]), int(place[start])
-            skip = max(0, -at)
-            if at > have or skip >= stop - start:
-                continue
-            # An instance that continued from an older state handles samples again: later rows replace earlier ones.
-            run = rows.part(start + skip, stop)
-            parts: tuple[Any, ...] = (run.seq, run.t_s, run.u_V, run.y_um, run.reason)
-            for column, more in zip(columns, parts, strict=True):
-                column[at + skip :] = list(more)
-    if not columns[0]:
-        return None
-    seq, t_s, u_V, y_um, reason = columns
-    return Rows(np.array(seq, dtype=np.int64), np.array(t_s), np.array(u_V), np.array(y_um), reason)
+        with contextlib.suppress(OSError):
+            rows = read_journal(path)
+            # Position relative to ``index``; the stored count wraps around.
+            place = (rows["index"] - index + INDEX_MODULUS // 2) % INDEX_MODULUS - INDEX_MODULUS // 2
+            for run in np.split(np.arange(len(rows)), np.nonzero(np.diff(place) != 1)[0] + 1):
+                at = int(place[run[0]]) if run.size else 0
+                skip = max(0, -at)
+                if at <= len(found) and skip < run.size:
+                    # An instance that continued from an older state handles samples again: later rows replace earlier.
+                    found = np.concatenate([found[: at + skip], rows[run[skip:]]])
+    return SampleBatch(*(found[name].copy() for name in COLUMNS[:4])) if found.size else None
 
 
 def number_of(path: Path) -> int:

@@ -10,19 +10,24 @@ import json
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeGuard
+from typing import Annotated, Any, Final, TypeGuard
 
 import numpy as np
 import zenoh
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.security.authenticator import own_authenticator
+from dehyst.service.viewer.output import Output
 from dehyst.service.viewer.records import Diagnostics, Event, Health, IntArray, Record, Status, Tracking, event_record
+
+#: Largest time that can be drawn, s: Rerun stores nanoseconds in 64 bits.
+MOST_S: Final = 9e9
 
 # --- Samples and their references
 
@@ -34,96 +39,67 @@ class ReferenceRing:
     size: int = 1 << 16
     _seq: IntArray = field(init=False)
     _value_um: FloatArray = field(init=False)
-    newest: int = field(init=False, default=-1)
 
     def __post_init__(self) -> None:
         self._seq = np.full(self.size, -1, dtype=np.int64)
         self._value_um = np.full(self.size, np.nan)
 
     def put(self, seq: IntArray, value_um: FloatArray) -> None:
-        """Store references; (n,) each. Negative sequence numbers are left out."""
-        keep = seq >= 0
-        seq, value_um = seq[keep][-self.size :], value_um[keep][-self.size :]
-        if seq.size:
-            slot = seq % self.size
-            self._seq[slot] = seq
-            self._value_um[slot] = value_um
-            self.newest = max(self.newest, int(seq.max()))
+        """Store references; (n,) each, from 0 on."""
+        slot = seq[-self.size :] % self.size
+        self._seq[slot], self._value_um[slot] = seq[-self.size :], value_um[-self.size :]
 
     def get(self, seq: IntArray) -> FloatArray:
         """References of these sequence numbers, µm; NaN where there is none, or none any more."""
         slot = seq % self.size
-        return np.where((self._seq[slot] == seq) & (seq >= 0), self._value_um[slot], np.nan)
+        return np.where(self._seq[slot] == seq, self._value_um[slot], np.nan)
 
 
 @dataclass(slots=True)
-class SampleReferenceJoin:
-    """Pairs the samples of one unit with the references of the same sequence number, whichever comes first.
+class Unit:
+    """The samples of one unit that wait for the references of the same sequence number.
 
-    A sample waits for its reference for at most ``patience_s`` of the stage's time, since references usually arrive
-    before the samples; then it goes on without. ``fallback`` holds the references of the unit that this one shares its
-    reference with.
+    References usually arrive before the samples. Where some are missing, the samples wait once more, and go on without.
+    ``shared`` holds the references of the unit that this one shares its reference with.
     """
 
     model: str
-    ring: ReferenceRing
-    fallback: ReferenceRing | None = None
-    patience_s: float = 0.5
+    shared: ReferenceRing
+    ring: ReferenceRing = field(default_factory=ReferenceRing)
     restarts: int = 0
-    _rows: FloatArray = field(init=False)
-    _seq: IntArray = field(init=False)
-    _newest_s: float = field(init=False, default=-np.inf)
+    _waiting: list[wire.SampleBatch] = field(default_factory=list)
+    _waited: bool = False
+    _newest_s: float = -np.inf
 
-    def __post_init__(self) -> None:
-        self._rows = np.empty((0, 3))
-        self._seq = np.empty(0, dtype=np.int64)
-
-    def put(self, seq: IntArray, t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
-        """Take n samples, (n,) each. If time runs backwards the stage has restarted: waiting samples are dropped."""
-        finite = np.abs(t_s) < 9e9  # Range of Rerun's nanoseconds in 64 bits; also drops NaN.
-        seq, t_s, u_V, y_um = seq[finite], t_s[finite], u_V[finite], y_um[finite]
-        if not seq.size:
+    def put(self, samples: wire.SampleBatch) -> None:
+        """Take samples. If time runs backwards the stage has restarted: waiting samples are dropped."""
+        samples = samples.where(np.abs(samples.t_s) < MOST_S)
+        if not len(samples):
             return
-        if t_s[0] < self._newest_s:
+        if samples.t_s[0] < self._newest_s:
             self.restarts += 1
-            self._seq, self._rows = self._seq[:0], self._rows[:0]
-        self._newest_s = float(t_s[-1])
-        self._seq = np.concatenate([self._seq, seq])
-        self._rows = np.concatenate([self._rows, np.column_stack([t_s, u_V, y_um])])
+            self._waiting = []
+        self._newest_s = float(samples.t_s[-1])
+        self._waiting.append(samples)
 
     def take(self, everything: bool = False) -> Tracking | None:
         """The samples that are ready, in order, or None. ``everything``: all of them, at the end of a run."""
-        if not self._seq.size:
+        if not self._waiting:
             return None
-        reference = self.ring.get(self._seq)
-        if self.fallback is not None:
-            reference = np.where(np.isnan(reference), self.fallback.get(self._seq), reference)
-        late = self._rows[:, 0] < self._rows[-1, 0] - self.patience_s
-        ready = ~np.isnan(reference) | late | everything
-        # In order: a sample with its reference waits behind one whose reference may still come.
-        n = int(np.argmin(ready)) if not ready.all() else ready.size
-        if n == 0:
+        samples = wire.joined(self._waiting)
+        own_um = self.ring.get(samples.seq)
+        reference_um = np.where(np.isnan(own_um), self.shared.get(samples.seq), own_um)
+        if np.isnan(reference_um).any() and not (self._waited or everything):
+            self._waited = True
             return None
-        done, seq = self._rows[:n], self._seq[:n]
-        self._rows, self._seq = self._rows[n:], self._seq[n:]
-        return Tracking(
-            self.model, seq, np.ascontiguousarray(done[:, 0]), np.ascontiguousarray(done[:, 1]),
-            np.ascontiguousarray(done[:, 2]), reference[:n],
-        )  # fmt: skip
+        self._waiting, self._waited = [], False
+        return Tracking(self.model, samples.seq, samples.t_s, samples.u_V, samples.y_um, reference_um)
 
 
 # --- The consumer
 
 #: A message about a sample may come so long before the sample itself, s of the stage's time: it has another key.
 _AHEAD_S = 1.0
-
-
-class BatchOutput(Protocol):
-    """Takes batches of records, as `service.viewer.output.Output` does."""
-
-    dropped: int
-
-    def offer(self, batch: Sequence[Record]) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +121,11 @@ class ConsumerConfig:
     model: str = "lssvm_adaptive"
     twins: tuple[tuple[str, str], ...] = ()
     changes_s: tuple[float, ...] = ()
-    batch_s: float = 0.2
+    batch_s: Annotated[float, Setting(unit="s", low=0.05, high=5.0)] = 0.2
     inbox: int = 20_000
 
     def __post_init__(self) -> None:
-        if not 0.05 <= self.batch_s <= 5.0:
-            raise InputError(f"batch_s: got {self.batch_s!r} s, expected 0.05 to 5")
+        check_bounds(self)
         axes = [self.axis, *(axis for axis, _ in self.twins)]
         if len(set(axes)) != len(axes) or len(set(self.models)) != len(axes):
             raise InputError(
@@ -168,34 +143,25 @@ class ConsumerConfig:
 class Consumer:
     """Runs from its construction until `close`. Declares its subscribers on ``session``, which the caller closes."""
 
-    def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[BatchOutput]) -> None:
+    def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[Output]) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
         self._by = own_authenticator()
         self._outputs = outputs
         self._inbox: deque[tuple[str, str, bytes]] = deque()
         main = ReferenceRing()
-        self._rings = {config.model: main}
-        self._joins = {config.model: SampleReferenceJoin(config.model, main)}
-        for _, model in config.twins:
-            self._rings[model] = ReferenceRing()
-            self._joins[model] = SampleReferenceJoin(model, self._rings[model], fallback=main)
+        self._units = {model: Unit(model, main) for model in config.models}
+        self._units[config.model].ring = main
         self._t_s, self._seq, self._dt_s = 0.0, 0, 0.0
         self._next_health = 0.0
         self._changes_s = sorted(config.changes_s)
         self._stop = threading.Event()
-        self._lock = threading.Lock()
         self._subscribers = [
             session.declare_subscriber(key, self._callback(kind, model, key))
             for kind, model, key in _subscriptions(config)
         ]
         self._thread = threading.Thread(target=self._run, name="view-batches")
         self._thread.start()
-
-    def pump(self) -> None:
-        """Decode the waiting messages and offer them as one batch; the thread does this every ``batch_s``."""
-        with self._lock:
-            self._offer(everything=False)
 
     def close(self) -> None:
         """Unsubscribe, pass on the rest, end the thread. May be called twice."""
@@ -205,9 +171,8 @@ class Consumer:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-            with self._lock:
-                self._next_health = 0.0
-                self._offer(everything=True)
+            self._next_health = 0.0
+            self._offer(everything=True)
 
     def _callback(self, kind: str, model: str, key: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
@@ -223,9 +188,10 @@ class Consumer:
 
     def _run(self) -> None:
         while not self._stop.wait(self.config.batch_s):
-            self.pump()
+            self._offer(everything=False)
 
     def _offer(self, everything: bool) -> None:
+        """Decode the waiting messages and offer them as one batch."""
         said: list[Record] = []
         # Only what waits now, so that a flood of messages does not keep this loop running.
         for _ in range(len(self._inbox)):
@@ -237,18 +203,17 @@ class Consumer:
                 continue
             if record is not None:
                 said.append(record)
-        tracking = [t for join in self._joins.values() if (t := join.take(everything)) is not None]
+        tracking = [t for unit in self._units.values() if (t := unit.take(everything)) is not None]
         while self._changes_s and self._changes_s[0] <= self._t_s:
             change_s = self._changes_s.pop(0)
             ago = round((self._t_s - change_s) / self._dt_s) if self._dt_s else 0
             said.append(Event(change_s, max(0, self._seq - ago), "change, as announced", "WARN", change=True))
         # Events first: a change must be known before the samples after it are drawn.
-        batch: list[Record] = [r for r in said if isinstance(r, Event)]
-        batch += tracking
-        batch += [r for r in said if not isinstance(r, Event)]
+        events = [record for record in said if isinstance(record, Event)]
+        batch = [*events, *tracking, *(record for record in said if not isinstance(record, Event))]
         if time.monotonic() >= self._next_health:
             self._next_health = time.monotonic() + 1.0
-            self.counts["restarts"] = sum(join.restarts for join in self._joins.values())
+            self.counts["restarts"] = sum(unit.restarts for unit in self._units.values())
             self.counts["dropped_batches"] = sum(output.dropped for output in self._outputs)
             batch.append(Health(self._t_s, self._seq, dict(self.counts)))
         if batch:
@@ -259,13 +224,13 @@ class Consumer:
         if kind == "sample":
             samples = wire.decode_samples(payload)
             self.counts["samples"] += len(samples)
-            self._joins[model].put(samples.seq, samples.t_s, samples.u_V, samples.y_um)
+            self._units[model].put(samples)
             if model == self.config.model:
                 self._clock(samples)
             return None
         if kind == "reference":
             block = wire.decode_reference(payload)
-            self._rings[model].put(block.seq + np.arange(len(block), dtype=np.int64), block.values)
+            self._units[model].ring.put(block.seq + np.arange(len(block), dtype=np.int64), block.values)
             return None
         fields = json.loads(payload)
         if not isinstance(fields, dict):
@@ -281,40 +246,32 @@ class Consumer:
     def _clock(self, samples: wire.SampleBatch) -> None:
         """Keep the newest pair of sequence number and time of the stage, and the sample time."""
         t_s, seq = float(samples.t_s[-1]), int(samples.seq[-1])
-        if not _is_time(t_s):
-            return
-        if seq > self._seq and t_s > self._t_s:
-            self._dt_s = (t_s - self._t_s) / (seq - self._seq)
-        self._t_s, self._seq = t_s, seq
+        if _is_time(t_s):
+            if seq > self._seq and t_s > self._t_s:
+                self._dt_s = (t_s - self._t_s) / (seq - self._seq)
+            self._t_s, self._seq = t_s, seq
 
     def _when(self, fields: Mapping[str, Any]) -> tuple[float, int]:
         """Time and number of a message: from its fields, from the time of its number, or those of the newest sample."""
         t_s, seq = fields.get("t_s"), fields.get("seq")
-        if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq <= wire.MAX_SEQ:
-            return (float(t_s) if _is_time(t_s) else self._t_s), self._seq
+        numbered = isinstance(seq, int) and not isinstance(seq, bool) and 0 <= seq <= wire.MAX_SEQ
+        number = int(seq) if numbered else self._seq  # type: ignore[arg-type]
+        ago_s = (self._seq - number) * self._dt_s
         if _is_time(t_s):
-            return float(t_s), seq
-        ago_s = (self._seq - seq) * self._dt_s
+            return float(t_s), number
         # A number from before a restart of the stage has no time here; one that is slightly ahead does.
-        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), seq
+        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), number
 
 
 def _is_time(value: Any) -> TypeGuard[float]:
-    """Whether this can be drawn as a time: Rerun stores nanoseconds in 64 bits."""
-    return isinstance(value, (int, float)) and -9e9 < value < 9e9
+    """Whether this can be drawn as a time."""
+    return isinstance(value, (int, float)) and abs(value) < MOST_S
 
 
-def _subscriptions(config: ConsumerConfig) -> list[tuple[str, str, str]]:
+def _subscriptions(config: ConsumerConfig) -> Iterator[tuple[str, str, str]]:
     """(kind, model, key) of every subscription."""
-    main = Keys(config.stage, config.axis)
-    found = [
-        ("sample", config.model, main.sample),
-        ("reference", config.model, main.reference),
-        ("status", config.model, main.status),
-        ("diagnostics", config.model, main.diagnostics),
-        ("event", config.model, main.event),
-    ]
+    for kind in ("sample", "reference", "status", "diagnostics", "event"):
+        yield kind, config.model, getattr(Keys(config.stage, config.axis), kind)
     for axis, model in config.twins:
-        keys = Keys(config.stage, axis)
-        found += [("sample", model, keys.sample), ("reference", model, keys.reference)]
-    return found
+        for kind in ("sample", "reference"):
+            yield kind, model, getattr(Keys(config.stage, axis), kind)

@@ -18,18 +18,16 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from dehyst.adaptive.errors import InputError
 from dehyst.service.background.job import step_back
+from dehyst.service.config.schema import Setting, check_bounds
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.viewer.records import Record, SceneConfig
 
-#: How long a child may take to start, s: it imports Rerun and numpy.
-START_S = 60.0
 _NICE: Final = 5
 #: How long a child may draw what waits after its parent has gone, s.
 GRACE_S: Final = 5.0
@@ -47,15 +45,14 @@ class OutputConfig:
     rrd: Path | None = None
     connect: str | None = None
     recording_id: str | None = None
-    queue_batches: int = 100
+    queue_batches: Annotated[int, Setting(low=1)] = 100
 
     def __post_init__(self) -> None:
         if (self.rrd is None) == (self.connect is None):
             raise InputError(f"rrd, connect: got {self.rrd!r} and {self.connect!r}, expected exactly one of them")
         if self.connect is not None and not _URL.match(self.connect):
             raise InputError(f"connect: got {self.connect!r}, expected such as rerun+http://127.0.0.1:9876/proxy")
-        if self.queue_batches < 1:
-            raise InputError(f"queue_batches: got {self.queue_batches}, expected at least 1")
+        check_bounds(self)
 
     @property
     def name(self) -> str:
@@ -63,29 +60,23 @@ class OutputConfig:
 
 
 class Output:
-    """A running sink. Raises InputError if the file cannot be written or the URL is invalid, ServiceError if the child
-    does not start."""
+    """A running sink; make it in the main thread. Raises InputError if the file cannot be written."""
 
     def __init__(self, config: OutputConfig) -> None:
         self.config = config
         self.dropped = 0
+        if config.rrd is not None:
+            make_file(config.rrd)
         # Spawn: zenoh's threads of this process do not survive a fork.
         context = multiprocessing.get_context("spawn")
         self._queue: Queue[Sequence[Record] | None] = context.Queue(config.queue_batches)
-        ours, theirs = context.Pipe(duplex=False)
-        self._process = context.Process(target=_draw, args=(config, self._queue, theirs), name="view", daemon=True)
-        self._process.start()
-        theirs.close()
-        trouble = self._greeting(ours)
-        ours.close()
-        if trouble is not None:
-            self.close(timeout_s=0.0)
-            raise trouble
-
-    @property
-    def alive(self) -> bool:
-        """Whether the child still runs."""
-        return self._process.is_alive()
+        self._process = context.Process(target=_draw, args=(config, self._queue), name="view", daemon=True)
+        # Ctrl-C reaches the whole process group; the parent decides when to stop. The child inherits this.
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            self._process.start()
+        finally:
+            signal.signal(signal.SIGINT, handler)
 
     @property
     def pid(self) -> int | None:
@@ -123,20 +114,21 @@ class Output:
         self._process.close()
         return finished
 
-    def _greeting(self, ours: Connection) -> Exception | None:
-        if not ours.poll(START_S):
-            return ServiceError(f"the viewer stream to {self.config.name} did not start within {START_S:g} s")
-        try:
-            message = ours.recv()
-        except EOFError:
-            return ServiceError(f"the viewer stream to {self.config.name} ended before it began")
-        return InputError(message) if message else None
+
+def make_file(path: Path) -> None:
+    """Make an empty file and its folders. Raises InputError if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+    except OSError as error:
+        raise InputError(f"rrd: cannot write {path}: {error}; name a file in a folder you may write to") from error
 
 
-def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greeting: Connection) -> None:
+def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None]) -> None:
     """The child process: draw batches until None comes or the parent is gone."""
-    # Ctrl-C reaches the whole process group; the parent decides when to stop.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_after, args=(parent,), name="view-end", daemon=True).start()
     # Low priority, in a session of its own: drawing must not take processor time from the service.
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
@@ -144,22 +136,8 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     from dehyst.service.viewer.rerun_sink import RerunSink
     from dehyst.service.viewer.scene import Scene
 
-    if config.connect is not None:
-        greeting.send("")  # Do not wait for the connection: a stuck viewer blocks it.
-    try:
-        sink = RerunSink(config.scene, rrd=config.rrd, connect=config.connect, recording_id=config.recording_id)
-    except InputError as error:
-        if config.connect is not None:
-            raise
-        greeting.send(str(error))
-        return
-    if config.rrd is not None:
-        greeting.send("")
-    greeting.close()
+    sink = RerunSink(config.scene, rrd=config.rrd, connect=config.connect, recording_id=config.recording_id)
     scene = Scene(sink, config.scene)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_after, args=(parent,), name="view-end", daemon=True).start()
     while True:
         try:
             batch = batches.get(timeout=1.0)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
+from dehyst.service.config.schema import Setting, check_bounds
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
@@ -48,21 +49,22 @@ class Tracking:
 
 
 @dataclass(frozen=True, slots=True)
-class Diagnostics:
+class _Fields:
+    t_s: float
+    seq: int
+    fields: Mapping[str, Any]
+
+
+class Diagnostics(_Fields):
     """Diagnostics of the learner, about 20 times a second; every field may be missing (docs/viewer.md)."""
 
-    t_s: float
-    seq: int
-    fields: Mapping[str, Any]
 
-
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(_Fields):
     """The service's status, about once a second."""
 
-    t_s: float
-    seq: int
-    fields: Mapping[str, Any]
+
+class Health(_Fields):
+    """Counts of the stream itself since its start, by name: received, malformed, dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +78,7 @@ class Event:
     change: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Health:
-    """Counts of the stream itself since its start, by name: received, malformed, dropped."""
-
-    t_s: float
-    seq: int
-    counts: Mapping[str, int]
-
-
+_POSITIVE = Setting(low=0, above=True)
 Record = Tracking | Diagnostics | Status | Event | Health
 
 
@@ -104,18 +98,15 @@ class SceneConfig:
 
     title: str
     models: tuple[str, ...] = ("lssvm_adaptive",)
-    range_um: float | None = None
-    loop_s: float = 2.0
-    mae_s: float = 0.5
-    history_s: float | None = None
+    range_um: Annotated[float | None, _POSITIVE] = None
+    loop_s: Annotated[float, _POSITIVE] = 2.0
+    mae_s: Annotated[float, _POSITIVE] = 0.5
+    history_s: Annotated[float | None, _POSITIVE] = None
 
     def __post_init__(self) -> None:
         if not self.models or len(set(self.models)) != len(self.models):
             raise InputError(f"models: got {self.models!r}, expected at least one name and none of them twice")
-        lengths = {"range_um": self.range_um, "loop_s": self.loop_s, "mae_s": self.mae_s, "history_s": self.history_s}
-        for name, length in lengths.items():
-            if length is not None and not (np.isfinite(length) and length > 0):
-                raise InputError(f"{name}: got {length!r}, expected a positive number")
+        check_bounds(self)
 
 
 # --- Events of the protocol

@@ -15,10 +15,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.viewer import style
+from dehyst.service.viewer.output import make_file
 from dehyst.service.viewer.plane import BOUNDS
 from dehyst.service.viewer.records import Event, IntArray, Record, SceneConfig, Tracking
 from dehyst.service.viewer.scene import Scene
@@ -34,9 +34,10 @@ VIEWER_MEMORY, SERVER_MEMORY = "1GiB", "64MiB"
 
 
 class RerunSink:
-    """Draws into the file ``rrd``, or without one into the viewer at ``connect``.
+    """Draws into the file ``rrd``, which is there already, or without one into the viewer at ``connect``.
 
-    Close it, or the end of the run may be missing. Raises InputError if the file cannot be written.
+    Close it, or the end of the run may be missing. Times are those of the stage, s; ``seq`` is the number of the newest
+    sample.
     """
 
     def __init__(
@@ -51,23 +52,13 @@ class RerunSink:
         # The live stream and the file of one run have the same id, so that the viewer shows them as one.
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id or str(uuid.uuid4()))
         if rrd is not None:
-            try:
-                rrd.parent.mkdir(parents=True, exist_ok=True)
-                rrd.open("ab").close()
-                self._stream.save(rrd, default_blueprint=views)
-            except (OSError, RuntimeError) as error:
-                raise InputError(
-                    f"rrd: cannot write {rrd}: {error}; name a file in a folder you may write to"
-                ) from error
+            self._stream.save(rrd, default_blueprint=views)
         else:
             self._stream.connect_grpc(connect, default_blueprint=views)
         self._stream.send_recording_name(config.title)
         for path, line in style.lines(config).items():
-            self._stream.log(
-                path,
-                rr.SeriesLines(names=line.name, colors=[line.colour], widths=[line.width]),
-                static=True,
-            )
+            drawn = rr.SeriesLines(names=line.name, colors=[line.colour], widths=[line.width])
+            self._stream.log(path, drawn, static=True)
 
     def scalars(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None:
         indexes = [rr.TimeColumn(TIMELINE, duration=t_s), rr.TimeColumn(SEQUENCE, sequence=seq)]
@@ -76,33 +67,22 @@ class RerunSink:
     def strips(
         self, path: str, t_s: float, seq: int, strips: Sequence[FloatArray], colour: style.Colour, radius: float
     ) -> None:
-        self._at(t_s, seq)
         drawn = [s for s in strips if len(s) > 1]
-        self._stream.log(path, rr.LineStrips2D(drawn, colors=[colour] * len(drawn), radii=[radius] * len(drawn)))
+        self._log(path, t_s, seq, rr.LineStrips2D(drawn, colors=[colour] * len(drawn), radii=[radius] * len(drawn)))
 
     def points(
-        self,
-        path: str,
-        t_s: float,
-        seq: int,
-        positions: FloatArray,
-        colour: style.Colour,
-        radius: float,
+        self, path: str, t_s: float, seq: int, positions: FloatArray, colour: style.Colour, radius: float,
         labels: Sequence[str] | None = None,
-    ) -> None:
-        self._at(t_s, seq)
+    ) -> None:  # fmt: skip
         shown = None if labels is None else True
-        self._stream.log(
-            path, rr.Points2D(positions, colors=[colour], radii=[radius], labels=labels, show_labels=shown)
-        )
+        drawn = rr.Points2D(positions, colors=[colour], radii=[radius], labels=labels, show_labels=shown)
+        self._log(path, t_s, seq, drawn)
 
     def text(self, path: str, t_s: float, seq: int, text: str, level: str) -> None:
-        self._at(t_s, seq)
-        self._stream.log(path, rr.TextLog(text, level=level))
+        self._log(path, t_s, seq, rr.TextLog(text, level=level))
 
     def document(self, path: str, t_s: float, seq: int, markdown: str) -> None:
-        self._at(t_s, seq)
-        self._stream.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+        self._log(path, t_s, seq, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
     def close(self) -> None:
         """Flush and close the file or connection; a file is complete afterwards. Raises ServiceError if it is not."""
@@ -113,102 +93,79 @@ class RerunSink:
         finally:
             self._stream.disconnect()
 
-    def _at(self, t_s: float, seq: int) -> None:
+    def _log(self, path: str, t_s: float, seq: int, drawn: Any) -> None:
         self._stream.set_time(TIMELINE, duration=t_s)
         self._stream.set_time(SEQUENCE, sequence=seq)
-
-
-def over_time(
-    name: str, paths: Iterable[str], times: rrb.VisibleTimeRange, corner: rrb.Corner2D = rrb.Corner2D.LeftTop
-) -> rrb.TimeSeriesView:
-    """A view of curves over time; its name states their unit."""
-    contents = [f"+ /{path}" for path in paths]
-    legend = rrb.PlotLegend(corner)
-    return rrb.TimeSeriesView(name=name, origin="/", contents=contents, plot_legend=legend, time_ranges=times)
-
-
-def plane_view(name: str, origin: str) -> rrb.Spatial2DView:
-    """A view of a plane with axes (`service.viewer.plane`)."""
-    x_range, y_range = map(list, BOUNDS)
-    bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=[16, 16, 18], visual_bounds=bounds)
-
-
-def desk(views: rrb.Container, panel: rrb.TimePanel) -> rrb.Blueprint:
-    """A blueprint of these views alone, with the time panel."""
-    return rrb.Blueprint(
-        views,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        panel,
-        auto_views=False,
-    )
+        self._stream.log(path, drawn)
 
 
 def blueprint(config: SceneConfig) -> rrb.Blueprint:
     """The views: tracking on the left, hysteresis in the middle, health of service and stream on the right."""
-    start = (
-        rrb.TimeRangeBoundary.infinite()
-        if config.history_s is None
-        else rrb.TimeRangeBoundary.cursor_relative(seconds=-config.history_s)
-    )
-    times = rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0))
-    # The curve that is drawn last lies on top.
-    main, models = config.models[0], config.models[::-1]
+    past_s, now = config.history_s, rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
+    infinite = rrb.TimeRangeBoundary.infinite()
+    start = infinite if past_s is None else rrb.TimeRangeBoundary.cursor_relative(seconds=-past_s)
+    times = rrb.VisibleTimeRange(TIMELINE, start=start, end=now)
+    main, last = config.models[0], f"last {config.loop_s:g} s"
 
     def plot(name: str, *paths: str) -> rrb.TimeSeriesView:
-        return over_time(name, paths, times)
+        """Curves over time; the name states their unit."""
+        legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+        contents = [f"+ /{path}" for path in paths]
+        return rrb.TimeSeriesView(name=name, origin="/", contents=contents, plot_legend=legend, time_ranges=times)
 
-    def tabs(*views: rrb.View) -> rrb.Tabs:
-        return rrb.Tabs(*views, active_tab=0)
+    def all_models(path: str) -> list[str]:
+        """The curve that is drawn last lies on top."""
+        return [path.format(model) for model in config.models[::-1]]
 
-    tracking = rrb.Vertical(
-        plot("Displacement: wanted and reached, µm", style.REFERENCE, style.displacement(main)),
-        tabs(
-            plot("Tracking error, µm", *map(style.error, models)),
-            plot(f"{style.name(main)} alone", style.error(main)),
-        ),
-        tabs(
-            plot(
-                f"Mean |error| over {config.mae_s:g} s, log10 of % of range (0 is 1 %, -1 is 0.1 %)",
-                *map(style.mean_error_log, models),
-            ),
-            plot("Linear, % of range", *map(style.mean_error, models)),
-        ),
-        tabs(
-            plot("Voltage and ±2σ, V", style.voltage(main), style.BAND_HIGH, style.BAND_LOW),
-            plot("σ of the voltage, mV", style.SIGMA),
-            plot("Voltages of all models, V", *map(style.voltage, models)),
-        ),
-        row_shares=(1.0, 1.2, 1.2, 0.9),
-    )
-    last = f"last {config.loop_s:g} s"
-    shapes = rrb.Vertical(
-        plane_view(f"What is left: error over wanted, {last}", style.DEVIATION_PLANE),
-        plane_view(f"Loop (u, y), {last}; amber: before the last change of the stage", style.LOOP_PLANE),
-        plane_view("What the learner holds: its window", style.WINDOW_PLANE),
-    )
+    def plane(name: str, origin: str) -> rrb.Spatial2DView:
+        x_range, y_range = map(list, BOUNDS)
+        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+        return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=[16, 16, 18], visual_bounds=bounds)
+
     columns = rrb.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)], text_log_columns=["LogLevel", "Body"]
     )
-    health = rrb.Vertical(
-        rrb.TextLogView(name="Events", origin=f"/{style.EVENTS}", columns=columns),
-        tabs(
-            plot("Gates: samples per second", "rate/**"),
-            plot("Gates: counts", "counter/**"),
-            plot("This stream: counts", "stream/**"),
-        ),
-        tabs(
-            plot("Drift filter: gain", "drift/gain"),
-            plot("Drift filter: offset, V", "drift/offset_V"),
-            plot("Learner", "learner/**"),
-        ),
-        plot("Query latency, µs", "latency/**"),
-        rrb.TextDocumentView(name="Status", origin=f"/{style.STATUS}"),
-        row_shares=(1.0, 1.0, 0.8, 0.8, 1.0),
+    decades = f"Mean |error| over {config.mae_s:g} s, log10 of % of range (0 is 1 %, -1 is 0.1 %)"
+    tabs: list[list[tuple[float, list[rrb.View]]]] = [
+        [
+            (1.0, [plot("Displacement: wanted and reached, µm", style.REFERENCE, style.DISPLACEMENT.format(main))]),
+            (1.2, [plot("Tracking error, µm", *all_models(style.ERROR)),
+                   plot(f"{style.name(main)} alone", style.ERROR.format(main))]),
+            (1.2, [plot(decades, *all_models(style.MEAN_ERROR_LOG)),
+                   plot("Linear, % of range", *all_models(style.MEAN_ERROR))]),
+            (0.9, [plot("Voltage and ±2σ, V", style.VOLTAGE.format(main), style.BAND_HIGH, style.BAND_LOW),
+                   plot("σ of the voltage, mV", style.SIGMA),
+                   plot("Voltages of all models, V", *all_models(style.VOLTAGE))]),
+        ],
+        [
+            (1.0, [plane(f"What is left: error over wanted, {last}", style.DEVIATION_PLANE)]),
+            (1.0, [plane(f"Loop (u, y), {last}; amber: before the last change of the stage", style.LOOP_PLANE)]),
+            (1.0, [plane("What the learner holds: its window", style.WINDOW_PLANE)]),
+        ],
+        [
+            (1.0, [rrb.TextLogView(name="Events", origin=f"/{style.EVENTS}", columns=columns)]),
+            (1.0, [plot("Gates: samples per second", "rate/**"), plot("Gates: counts", "counter/**"),
+                   plot("This stream: counts", "stream/**")]),
+            (0.8, [plot("Drift filter: gain", "drift/gain"), plot("Drift filter: offset, V", "drift/offset_V"),
+                   plot("Learner", "learner/**")]),
+            (0.8, [plot("Query latency, µs", "latency/**")]),
+            (1.0, [rrb.TextDocumentView(name="Status", origin=f"/{style.STATUS}")]),
+        ],
+    ]  # fmt: skip
+    stacks = [
+        rrb.Vertical(
+            *(rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0] for _, views in column),
+            row_shares=[share for share, _ in column],
+        )
+        for column in tabs
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(*stacks, column_shares=(1.5, 1.0, 0.95)),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_views=False,
     )
-    views = rrb.Horizontal(tracking, shapes, health, column_shares=(1.5, 1.0, 0.95))
-    return desk(views, rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"))
 
 
 def viewer_command(port: int, *, headless: bool = False, web_port: int | None = None) -> list[str]:
@@ -243,7 +200,7 @@ def page_of(url: str, web_port: int) -> str:
 # --- Draws a run that was computed: the same scene as live, from arrays.
 
 #: Length of the pieces that a record is cut into, s: like the batches of a live stream.
-PIECE_S = 0.5
+PIECE_S = 0.2
 
 
 def write_recording(path: Path, config: SceneConfig, records: Iterable[Record]) -> None:
@@ -252,7 +209,7 @@ def write_recording(path: Path, config: SceneConfig, records: Iterable[Record]) 
     ``records`` may come in any order; a `Tracking` may hold a whole run. They are cut into pieces and drawn in order
     of time, as in a live stream. Raises InputError if the file cannot be written.
     """
-    path.unlink(missing_ok=True)
+    make_file(path)
     sink = RerunSink(config, rrd=path)
     try:
         Scene(sink, config).take_all(in_order(records))

@@ -1,21 +1,21 @@
-"""Entity paths, colours and names of the curves, shared by scene, blueprint and tests."""
+"""What is drawn: entity paths, colours and names of the curves, shared by scene, views and tests."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from dehyst.service.viewer.colours import model_colour, rgb
 from dehyst.service.viewer.records import SceneConfig
 
 Colour = tuple[int, int, int]
 
-WHITE: Colour = (235, 235, 235)
-AMBER: Colour = (255, 190, 70)
-FRAME: Colour = (70, 70, 74)
-LABEL: Colour = (190, 190, 190)
+WHITE: Final[Colour] = (235, 235, 235)
+AMBER: Final[Colour] = (255, 190, 70)
+FRAME: Final[Colour] = (70, 70, 74)
+LABEL: Final[Colour] = (190, 190, 190)
 
 #: Names of the models in legends.
-NAMES: dict[str, str] = {
+NAMES: Final = {
     "linear": "linear",
     "bouc_wen": "Bouc-Wen",
     "mpi": "MPI",
@@ -23,37 +23,25 @@ NAMES: dict[str, str] = {
     "lssvm_adaptive": "LSSVM, adaptive",
 }
 
-REFERENCE = "displacement/reference_um"
+#: Paths of each model's curves; the braces take the model.
+DISPLACEMENT, VOLTAGE, ERROR = "displacement/{}_um", "voltage/{}_V", "error_um/{}"
+MEAN_ERROR, MEAN_ERROR_LOG = "mean_error_pct/{}", "mean_error_log10_pct/{}"
+REFERENCE: Final = "displacement/reference_um"
 BAND_HIGH, BAND_LOW = "voltage/plus_2_sigma_V", "voltage/minus_2_sigma_V"
-SIGMA = "voltage_sigma_mV"
+SIGMA: Final = "voltage_sigma_mV"
+#: Planes, with the names of their axes, and what is drawn in them.
 LOOP_PLANE, DEVIATION_PLANE, WINDOW_PLANE = "loops", "deviation", "window"
+AXES: Final = {
+    LOOP_PLANE: ("voltage, V", "displacement, µm"),
+    DEVIATION_PLANE: ("wanted, µm", "error, µm"),
+    WINDOW_PLANE: ("displacement, µm", "velocity, µm/s"),
+}
 LOOP_BEFORE, LOOP_NOW = "loops/before_change", "loops/now"
-WINDOW_POINTS = "window/points"
+DEVIATION, WINDOW_POINTS = "deviation/{}", "window/points"
 EVENTS, STATUS = "events", "status"
-
-
-def displacement(model: str) -> str:
-    return f"displacement/{model}_um"
-
-
-def error(model: str) -> str:
-    return f"error_um/{model}"
-
-
-def mean_error(model: str) -> str:
-    return f"mean_error_pct/{model}"
-
-
-def mean_error_log(model: str) -> str:
-    return f"mean_error_log10_pct/{model}"
-
-
-def voltage(model: str) -> str:
-    return f"voltage/{model}_V"
-
-
-def deviation(model: str) -> str:
-    return f"{DEVIATION_PLANE}/{model}"
+#: Where a figure of the diagnostics is drawn, if not under ``learner/``; groups are objects of figures.
+FIGURES: Final = {"gain": "drift/gain", "offset_V": "drift/offset_V"}
+GROUPS: Final = {"query_us": "latency/{}_us", "counters": "counter/{}"}
 
 
 def colour(model: str) -> Colour:
@@ -62,34 +50,37 @@ def colour(model: str) -> Colour:
 
 
 def name(model: str) -> str:
+    """The name of a model in a legend."""
     return NAMES.get(model, model)
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(NamedTuple):
     """How one curve is drawn: ``width`` in points of the screen. The titles of the plots give the units."""
 
     name: str
     colour: Colour
-    width: float = 1.0
+    width: float = 1.5
+
+
+#: The curves that are not those of a model.
+_LINES: Final = {
+    REFERENCE: Line("wanted", WHITE, 1.0),
+    BAND_HIGH: Line("+2σ", AMBER, 1.0),
+    BAND_LOW: Line("−2σ", AMBER, 1.0),
+    SIGMA: Line("σ", AMBER),
+    "latency/p50_us": Line("median", WHITE),
+    "latency/p99_us": Line("99th percentile", AMBER),
+    "drift/gain": Line("gain", WHITE),
+    "drift/offset_V": Line("offset", AMBER),
+    "rate/learnt": Line("learnt", colour("lssvm_adaptive"), 2.0),
+}
 
 
 def lines(config: SceneConfig) -> dict[str, Line]:
     """Every curve that is known before the first record, by path."""
-    main = config.models[0]
-    found = {REFERENCE: Line("wanted", WHITE, 1.0)}
+    found = dict(_LINES)
     for model in config.models:
-        hue, called, width = colour(model), name(model), 2.0 if model == main else 1.0
-        found[displacement(model)] = Line(f"reached: {called}", hue, 2.5)
-        found[voltage(model)] = Line(called, hue, width)
-        for path in (error(model), mean_error(model), mean_error_log(model)):
-            found[path] = Line(called, hue, width)
-    found[BAND_HIGH] = Line("+2σ", AMBER, 1.0)
-    found[BAND_LOW] = Line("−2σ", AMBER, 1.0)
-    found[SIGMA] = Line("σ", AMBER, 1.5)
-    found["latency/p50_us"] = Line("median", WHITE, 1.5)
-    found["latency/p99_us"] = Line("99th percentile", AMBER, 1.5)
-    found["drift/gain"] = Line("gain", WHITE, 1.5)
-    found["drift/offset_V"] = Line("offset", AMBER, 1.5)
-    found["rate/learnt"] = Line("learnt", colour("lssvm_adaptive"), 2.0)
+        line = Line(name(model), colour(model), 2.0 if model == config.models[0] else 1.0)
+        found |= {path.format(model): line for path in (VOLTAGE, ERROR, MEAN_ERROR, MEAN_ERROR_LOG)}
+        found[DISPLACEMENT.format(model)] = Line(f"reached: {line.name}", line.colour, 2.5)
     return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from dehyst.sim.fitting.fit_data import FitData
@@ -14,8 +13,8 @@ from dehyst.sim.pictures import Picture, over_time
 from dehyst.sim.readings.noise import Defect
 from dehyst.sim.readings.sight import Sight
 
-#: Schemas of report.json. 1 has no verdict "partly", no witnesses, no ceiling and no defects.
-SCHEMAS = (1, 2)
+#: Version of report.json.
+SCHEMA = 2
 FOLDS, TEST = "folds of the recording", "test recording"
 
 
@@ -89,47 +88,39 @@ class Diagnosis:
         """Nominal and extended model on the recording that decides: the test recording, if there is one."""
         return self.on_test or (self.nominal, self.extended)
 
-    def as_dict(self, schema: int = SCHEMAS[-1]) -> dict[str, Any]:
-        """The content of report.json. Raises InputError for a schema that is not one of `SCHEMAS`."""
-        if schema not in SCHEMAS:
-            raise InputError(f"schema: got {schema}, expected one of {', '.join(map(str, SCHEMAS))}")
-        out: dict[str, Any] = {
-            "schema": schema,
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        effects = [
+            {
+                "name": c.name,
+                "alternatives": list(c.alternatives),
+                "parameters": c.parameters,
+                "intervals": {k: list(v) for k, v in c.intervals.items()},
+                "heldout_gain": c.heldout_gain,
+                "p_value": c.p_value,
+                "witness": None if c.witness is None else {"seen": c.witness.seen, "words": c.witness.words},
+                "instead": c.instead,
+            }
+            for c in self.causes
+        ]
+        return {
+            "schema": SCHEMA,
             "verdict": self.verdict,
             "nominal": {"rmse_um": self.nominal_rmse_um, "heldout_rmse_um": self.nominal_heldout_um},
             "extended": {"rmse_um": self.extended_rmse_um, "heldout_rmse_um": self.extended_heldout_um},
             "noise_floor_um": self.noise_floor_um,
-            "effects": [
-                {
-                    "name": c.name,
-                    "alternatives": list(c.alternatives),
-                    "parameters": c.parameters,
-                    "intervals": {k: list(v) for k, v in c.intervals.items()},
-                    "heldout_gain": c.heldout_gain,
-                    "p_value": c.p_value,
-                }
-                for c in self.causes
-            ],
+            "effects": effects,
             "not_excited": list(self.not_excited),
             "next_experiment": self.next_experiment,
+            "explainable": {
+                "black_box_rmse_um": self.ceiling_um,
+                "explained_share": self.explained,
+                "learnt_from_recording_rmse_um": self.taught_um,
+            },
+            "defects": [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects],
+            "left": list(self.left),
+            "tried_not_named": [*self.partial, *self.uncertain],
         }
-        if schema == 1:
-            if self.verdict == "partly":
-                out["verdict"] = "effects" if self.explained > 0.4 else "unexplained"
-            return out
-        for effect, cause in zip(out["effects"], self.causes, strict=True):
-            w = cause.witness
-            effect["witness"] = None if w is None else {"seen": w.seen, "words": w.words}
-            effect["instead"] = cause.instead
-        out["explainable"] = {
-            "black_box_rmse_um": self.ceiling_um,
-            "explained_share": self.explained,
-            "learnt_from_recording_rmse_um": self.taught_um,
-        }
-        out["defects"] = [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects]
-        out["left"] = list(self.left)
-        out["tried_not_named"] = [*self.partial, *self.uncertain]
-        return out
 
 
 def picture(cause: NamedCause, data: FitData, catalogue: Catalogue = CATALOGUE) -> Picture:

@@ -17,7 +17,7 @@ import pytest
 from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
 from dehyst.service.config.settings import read_config
-from dehyst.service.stage_node.example_files import DT_S, SHORT_S, _readings
+from dehyst.service.stage_node.example_files import DT_S, LENGTH_S, _readings
 from dehyst.sim.signals.voltages import training_input
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +67,7 @@ def test_every_link_leads_to_a_file_of_the_checkout() -> None:
 def test_the_servo_of_the_page_gains_by_the_model_and_makes_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    u_V = training_input(DT_S, SHORT_S)[1]
+    u_V = training_input(DT_S, LENGTH_S)[1]
     rows = np.column_stack([np.arange(u_V.size) * DT_S, u_V, _readings(u_V)])
     np.savetxt(tmp_path / "recording.csv", rows, delimiter=",", header="t_s,u_V,y_um", comments="", fmt="%.9g")
     files = (str(tmp_path / "recording.csv"), str(tmp_path / "stage.npz"))

@@ -1,13 +1,5 @@
-"""``dehyst completion``: the completion script of a shell, which then completes without starting Python."""
+"""``dehyst completion``: the completion script of a shell, which then completes without starting Python.
 
-from __future__ import annotations
-
-import argparse
-
-from dehyst.service.cli.main import build_parser
-from dehyst.service.cli.options import add_epilog
-
-EPILOG = """\
 Make the folders first where they are missing:
 
   mkdir -p ~/.local/share/bash-completion/completions ~/.zfunc ~/.config/fish/completions
@@ -20,10 +12,15 @@ Make the folders first where they are missing:
 The script holds commands and options of this version: print it again after an update.
 """
 
+from __future__ import annotations
+
+import argparse
+
+from dehyst.service.cli.main import build_parser
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    add_epilog(parser, EPILOG)
     parser.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"), help="the shell")
 
 

@@ -1,4 +1,18 @@
-"""``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain."""
+"""``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain.
+
+Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
+extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
+Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
+
+  dehyst diagnose recording.csv --out out/diagnosis
+  dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
+  dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 1e-3 --out out/diagnosis
+  dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
+      --out out/diagnosis
+  dehyst diagnose train.csv --nominal linear --range 0:10 --out out/diagnosis --json
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +22,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_shared, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
 from dehyst.service.protocol.errors import FieldError
-
-EPILOG = """\
-Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
-extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
-Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
-
-  dehyst diagnose recording.parquet --out out/diagnosis
-  dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
-  dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 1e-3 --out out/diagnosis
-  dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
-      --out out/diagnosis
-  dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst diagnose``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "help": "folder for the report"})
     what = parser.add_mutually_exclusive_group()
@@ -44,15 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "test-range",
         test={"help": "another recording of the stage, same columns: nothing is fitted, the verdict is its own"},
         seed={"help": "seed of the null distribution (%(default)s)"},
-    )
-    # It used to leave out a file that is written no more.
-    parser.add_argument("--no-rrd", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--schema",
-        type=int,
-        choices=(1, 2),
-        default=2,
-        help="schema of report.json: 1 has no verdict partly, no direct tests, no black box (%(default)s)",
     )
     add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser, test=True)
@@ -94,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         test="" if args.test is None else args.test.name,
         nominal=str(args.stage.name) if args.stage is not None else args.nominal,
     )
-    data = write_report(args.out, diagnosis, source, schema=args.schema)
+    data = write_report(args.out, diagnosis, source)
     say(f"[100 %] done in {time.perf_counter() - start:.1f} s")
     print(json.dumps(data) if args.json else summary(data, args.out))
     return 0

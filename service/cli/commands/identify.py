@@ -1,4 +1,15 @@
-"""``dehyst identify``: the inverse models of a stage from a recording."""
+"""``dehyst identify``: the inverse models of a stage from a recording.
+
+Errors are of the inverse: the model gets the measured motion of data it has not seen, and its voltage is compared with
+the applied one. The error in µm is that voltage error times the mean gain of the stage.
+
+  dehyst identify recording.csv --out stage.npz
+  dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
+      --out stage.npz
+  dehyst identify train.csv --test test.csv --range 1:11 --out stage.npz
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import check_name
@@ -23,53 +34,32 @@ CLIPPED = ("clipped", "warning")
 
 log = logging.getLogger("dehyst.identify")
 
-EPILOG = """\
-Errors are of the inverse: the model gets the measured motion of data it has not seen, and its voltage is compared with
-the applied one. The error in µm is that voltage error times the mean gain of the stage.
-
-  dehyst identify recording.csv --out stage.npz
-  dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
-      --out stage.npz
-  dehyst identify training.parquet --test other.parquet --range 2:40 --out stage.npz
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst identify``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "metavar": "MODEL.npz", "help": "file for the models"})
     judged = parser.add_mutually_exclusive_group()
     judged.add_argument("--holdout", type=float, default=0.25, help="share at the end held out for judging (0.25)")
     add_shared(judged, test={"help": "judge on this recording instead"})
     add_shared(parser, "test-range")
-    parser.add_argument(
-        "--keep-apart",
-        action="store_true",
-        help="write the models that never saw the held-out part (default: identify again from all of the recording)",
-    )
-    parser.add_argument("--models", metavar="A,B", help="which models (all five)")
-    parser.add_argument(
-        "--fit-samples",
-        type=int,
-        default=100_000,
-        metavar="N",
-        help="most samples for the fits; of a longer recording every k-th one is used (%(default)s)",
-    )
-    parser.add_argument("--support", type=int, default=500, metavar="N", help="support vectors of the LSSVMs (500)")
-    add_shared(
-        parser,
-        stage={"help": "name of the stage on the wire (%(default)s)"},
-        axis={"help": "name of its axis on the wire (%(default)s)"},
-    )
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="file for the picture (beside the models)")
+    add = parser.add_argument
+    add("--keep-apart", action="store_true", help="write the models that never saw the held-out part (default: "
+        "identify again from all of the recording)")  # fmt: skip
+    add("--models", metavar="A,B", help="which models (all five)")
+    add("--fit-samples", type=int, default=100_000, metavar="N",
+        help="most samples for the fits; of a longer recording every k-th one is used (%(default)s)")  # fmt: skip
+    add("--support", type=int, default=500, metavar="N", help="support vectors of the LSSVMs (500)")
+    add_shared(parser, "stage", "axis")
+    add("--picture", type=Path, metavar="FILE.png", help="file for the picture (beside the models)")
     add_shared(parser, "no-pictures", "quiet", "json")
     add_mapping_arguments(parser, test=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
-    from dehyst.service.identification.identifying import NAMES, Stretch, identify_all, split_at, thinning
+    from dehyst.service.identification import identifying
+    from dehyst.service.identification.identifying import NAMES, Stretch
     from dehyst.service.storage.model_file import BundleMeta, write_bundle
     from dehyst.service.storage.output import check_file
     from dehyst.sim.recordings import check, repaired, require_usable
@@ -79,10 +69,8 @@ def run(args: argparse.Namespace) -> int:
     names = tuple(args.models.split(",")) if args.models else NAMES
     if unknown := [name for name in names if name not in NAMES]:
         raise FieldError("--models", repr(unknown[0]), f"some of {', '.join(NAMES)}")
-    if args.support < 10:
-        raise FieldError("--support", args.support, "at least 10 support vectors")
-    if args.fit_samples < 1000:
-        raise FieldError("--fit-samples", args.fit_samples, "at least 1000 samples")
+    check_number("--support", args.support, "support vectors", low=10)
+    check_number("--fit-samples", args.fit_samples, "samples", low=1000)
     picture = None if args.no_pictures else args.picture or args.out.with_suffix(".png")
     check_file("--out", args.out)
     if picture is not None:
@@ -99,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     for line in whole_repaired.done:
         say(f"  repaired: {line}")
     dt_s = recording.dt_s
-    every = thinning(len(whole_repaired.valid), dt_s, args.fit_samples)
+    every = identifying.thinning(len(whole_repaired.valid), dt_s, args.fit_samples)
     if every > 1:
         say(
             f"  long recording: fits and errors use one of {every} samples, one each {dt_s * every:g} s; motion "
@@ -118,17 +106,17 @@ def run(args: argparse.Namespace) -> int:
         test_findings = check(tested)
         say(describe(tested, test_findings))
         require_usable(tested, test_findings)
-        train, test, follows, again = whole, Stretch.of(repaired(tested), every), False, None
+        train, test, again = whole, Stretch.of(repaired(tested), every), None
         judged_on = str(args.test)
     else:
-        split = split_at(len(whole), args.holdout)
-        train, test, follows = whole.part(0, split), whole.part(split, len(whole)), True
+        split = identifying.split_at(len(whole), args.holdout)
+        train, test = whole.part(0, split), whole.part(split, len(whole))
         again = None if args.keep_apart else whole
         judged_on = f"the last {100 * args.holdout:g} % of the recording"
 
-    results = identify_all(
-        train, test, dt_s * every, follows=follows, whole=again, names=names, n=args.support, most=args.fit_samples,
-        serve_dt_s=dt_s, progress=_progress(say, names, len(train), len(again or train)),
+    results = identifying.identify_all(
+        train, test, dt_s * every, follows=args.test is None, whole=again, names=names, n=args.support,
+        most=args.fit_samples, serve_dt_s=dt_s, progress=_progress(say, names, len(train), len(again or train)),
     )  # fmt: skip
     models = {result.name: result.model for result in results if result.model is not None}
     for result in results:
@@ -138,31 +126,20 @@ def run(args: argparse.Namespace) -> int:
         log.error("no model could be identified")
         return 1
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
-    meta = BundleMeta(
-        stage=args.stage,
-        axis=args.axis,
-        dt_s=dt_s,
-        source=args.data.name,
-        source_sha256=sha256,
-        y_min_um=float(whole.motion[:, 0].min()),
-        y_max_um=float(whole.motion[:, 0].max()),
-        u_min_V=float(whole.u_V.min()),
-        u_max_V=float(whole.u_V.max()),
-        notes={
-            "judged_on": Path(judged_on).name if args.test is not None else judged_on,
-            "heldout_rmse_um": {r.name: r.score.rmse_um for r in results if r.score is not None},
-            "sensor_late": args.sensor_late or 0,
-            "y_unit": y_unit,
-            "fitted_from_every": every,
-            "clipped": [finding.message for finding in findings if (finding.kind, finding.severity) == CLIPPED],
-        },
-    )
+    notes = {
+        "judged_on": Path(judged_on).name if args.test is not None else judged_on,
+        "heldout_rmse_um": {r.name: r.score.rmse_um for r in results if r.score is not None},
+        "sensor_late": args.sensor_late or 0,
+        "y_unit": y_unit,
+        "fitted_from_every": every,
+        "clipped": [finding.message for finding in findings if (finding.kind, finding.severity) == CLIPPED],
+    }
+    y_um, u_V = ((float(values.min()), float(values.max())) for values in (whole.motion[:, 0], whole.u_V))
+    meta = BundleMeta(args.stage, args.axis, dt_s, args.data.name, sha256, *y_um, *u_V, notes)
     write_bundle(args.out, models, meta)
     if picture is not None:
-        from dehyst.service.identification.identifying import draw_identification
-
         title = f"{args.data.name}: inverse models, judged on {judged_on}"
-        draw_identification(picture, title, train, test, dt_s * every, results, gain)
+        identifying.draw_identification(picture, title, train, test, dt_s * every, results, gain)
     summary: dict[str, Any] = {
         "data": str(args.data),
         "sha256": sha256,

@@ -1,4 +1,12 @@
-"""``dehyst look``: what a file holds, what was understood, and the command that would use it."""
+"""``dehyst look``: what a file holds, what was understood, and the command that would use it.
+
+Of two columns in V it asks which is which (exit status 1); the second example answers.
+
+  dehyst look scope.csv
+  dehyst look scope.csv --column u=CH1 --column y=CH2 --scale y=10
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_shared
 from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from, to_fill_in
 from dehyst.sim.recordings import Finding, Recording, check
 from dehyst.sim.recordings.columns import MissingError
 from dehyst.sim.recordings.reader import read, read_table
 from dehyst.sim.recordings.table import Table
 
-EPILOG = """\
-Of two columns in V it asks which is which (exit status 1); the second example answers.
-
-  dehyst look scope.csv
-  dehyst look scope.csv --column u=CH1 --column y=CH2 --scale y=10
-"""
 #: Most points of a line in the picture.
 _POINTS = 4000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst look``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="FILE", help="a recording: a file, or a folder of segments")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="file for the picture (FILE.look.png, here)")
     add_shared(parser, "no-pictures", "json")
@@ -72,21 +73,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _columns(table: Table) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "unit": table.units.get(name), "shape": list(array.shape), **_range(array)}
-        for name, array in table.arrays.items()
-    ]
-
-
-def _range(array: NDArray[Any]) -> dict[str, Any]:
-    """Smallest, largest and missing values of numbers; of texts the first one."""
-    if array.dtype.kind not in "fiub" or not array.size:
-        return {"min": None, "max": None, "missing": 0, "first": str(array.reshape(-1)[0])[:40] if array.size else None}
-    values = np.asarray(array, dtype=np.float64)
-    good = values[np.isfinite(values)]
-    if not good.size:
-        return {"min": None, "max": None, "missing": int(values.size), "first": None}
-    return {"min": float(good.min()), "max": float(good.max()), "missing": int(values.size - good.size), "first": None}
+    """Each column: smallest, largest and missing values of numbers; of texts the first one."""
+    found = []
+    for name, array in table.arrays.items():
+        numbers = array.dtype.kind in "fiub"
+        values = np.asarray(array if numbers else (), dtype=np.float64)
+        good = values[np.isfinite(values)]
+        ends = {"min": float(good.min()), "max": float(good.max())} if good.size else {"min": None, "max": None}
+        first = None if numbers or not array.size else str(array.reshape(-1)[0])[:40]
+        about = {"name": name, "unit": table.units.get(name), "shape": list(array.shape)}
+        found.append({**about, **ends, "missing": int(values.size - good.size), "first": first})
+    return found
 
 
 def _understood(recording: Recording) -> dict[str, Any]:

@@ -1,37 +1,33 @@
-"""``dehyst metrics``: the status of all axes for Prometheus."""
+"""``dehyst metrics``: the status of all axes for Prometheus.
 
-from __future__ import annotations
-
-import argparse
-
-from dehyst.service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
-from dehyst.service.protocol.errors import FieldError
-
-EPILOG = """\
 Grafana: import deploy/grafana-dashboard.json. Names and alarms: docs/monitoring.md.
 
   dehyst metrics --port 9464
   curl http://127.0.0.1:9464/metrics
 """
 
+from __future__ import annotations
+
+import argparse
+
+from dehyst.service.cli import options
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
-    add_connection(parser)
-    add_selection(parser)
+    options.add_connection(parser)
+    options.add_selection(parser)
     add("--port", type=int, default=9464, metavar="N", help="port of the page, 0 for a free one (%(default)s)")
     add("--address", default="127.0.0.1", metavar="IP", help="address to listen at (%(default)s, this machine only)")
     add("--once", action="store_true", help="print the page once, and exit")
-    add_shared(parser, "duration")
+    options.add_shared(parser, "duration")
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until interrupted. Returns 0. Raises InputError where the package or the port is missing."""
-    check_selection(args)
-    if not 0 <= args.port <= 65535:
-        raise FieldError("--port", args.port, "0 to 65535")
+    options.check_selection(args)
+    options.check_number("--port", args.port, low=0, high=65_535)
     from dehyst.service.operating.metrics import page, serve_page
     from dehyst.service.operating.remote import statuses
     from dehyst.service.runtime.session import open_client

@@ -1,4 +1,15 @@
-"""``dehyst modes``: the modes of a stage from periodic recordings, and how they change with the amplitude."""
+"""``dehyst modes``: the modes of a stage from periodic recordings, and how they change with the amplitude.
+
+For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
+amplitude, at least as many realisations as drives. Recordings of the same rms count as realisations of one amplitude.
+Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/modes.md).
+
+  dehyst modes low.npz high.npz --column u=u --unit u=V --column rate=fs_hz --out out/modes
+  dehyst modes a.csv b.csv c.csv --column u=CH1,CH2,CH3 --unit u=V --column y=X,Y --unit y=nm --period 8192 \\
+      --skip-periods 1 --out out/modes
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
@@ -8,47 +19,25 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
 from dehyst.service.identification.recording_options import add_mapping_arguments, mapping_from
-from dehyst.service.protocol.errors import FieldError
-
-EPILOG = """\
-For periodic drives in steady state, such as random-phase multisines: one or several drives and outputs, and, for each
-amplitude, at least as many realisations as drives. Recordings of the same rms count as realisations of one amplitude.
-Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/modes.md).
-
-  dehyst modes low.npz high.npz --column u=u --unit u=V --column rate=fs_hz --out out/modes
-  dehyst modes a.csv b.csv c.csv --column u=CH1,CH2,CH3 --unit u=V --column y=X,Y --unit y=nm --period 8192 \\
-      --skip-periods 1 --out out/modes
-  dehyst modes train.npz --test test.npz --period 4096 --out out/modes --json
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst modes``."""
-    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, nargs="+", metavar="RECORDING", help="recordings to fit, of any amplitudes")
     add_shared(
         parser,
         out={"required": True, "help": "folder for the report"},
         test={"nargs": "+", "default": [], "help": "recordings to judge by, of the same amplitudes; not fitted"},
     )
-    parser.add_argument("--period", type=int, metavar="N", help="length of a period, samples")
-    parser.add_argument(
-        "--skip-periods", type=int, default=0, metavar="K", help="periods at the start that are not steady (0)"
-    )
-    parser.add_argument(
-        "--hold-out",
-        type=int,
-        metavar="R",
-        help="realisations to hold out at amplitudes without a test recording (a third, where enough remain)",
-    )
-    parser.add_argument(
-        "--start-modes", type=int, default=30, metavar="N", help="pole pairs to start from; useless ones go (30)"
-    )
-    parser.add_argument(
-        "--degree", type=int, metavar="D", help="of the polynomials in the amplitude (2, or what the amplitudes allow)"
-    )
+    add = parser.add_argument
+    add("--period", type=int, metavar="N", help="length of a period, samples")
+    add("--skip-periods", type=int, default=0, metavar="K", help="periods at the start that are not steady (0)")
+    add("--hold-out", type=int, metavar="R", help="realisations to hold out at amplitudes without a test recording "
+        "(a third, where enough remain)")  # fmt: skip
+    add("--start-modes", type=int, default=30, metavar="N", help="pole pairs to start from; useless ones go (30)")
+    add("--degree", type=int, metavar="D", help="of the polynomials in the amplitude (2, or what the amplitudes allow)")
     add_shared(parser, "no-pictures", "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser)
 
@@ -60,8 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from dehyst.sim.modal import FitSettings, study
     from dehyst.sim.modal.reading import read_periodic
 
-    if args.start_modes < 1:
-        raise FieldError("--start-modes", args.start_modes, "1 or more")
+    check_number("--start-modes", args.start_modes, low=1)
     say = progress_printer(args.quiet)
     start = time.perf_counter()
     mapping = mapping_from(args)

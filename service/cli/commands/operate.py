@@ -1,4 +1,8 @@
-"""The operator's commands: freeze, thaw, rollback, checkpoints, select, retune, ask-diagnosis."""
+"""The operator's commands: freeze, thaw, rollback, checkpoints, select, retune, ask-diagnosis.
+
+The service records who commanded what, when, and from which sample on it took effect. Where other machines can reach
+the service, zenoh's access control decides what an operator may do (docs/access.md, docs/operating.md).
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,11 @@ import json
 import time
 from typing import Any, Final
 
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.operating.remote import operate
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import open_client
 
-EPILOG = """\
-The service records who commanded what, when, and from which sample on it took effect. Where other machines can reach
-the service, zenoh's access control decides what an operator may do (docs/access.md, docs/operating.md).
-
-"""
 _EXAMPLES: Final = {
     "freeze": "  dehyst freeze --axis x --who alice\n",
     "thaw": "  dehyst thaw --axis x --who alice\n",
@@ -36,7 +35,7 @@ _OF_FLEETS: Final = ("freeze", "thaw", "rollback")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command that the parser is named after, with units in the help."""
     verb = parser.prog.split()[-1]
-    add_epilog(parser, EPILOG + _EXAMPLES[verb])
+    parser.epilog = f"{parser.epilog}\n{_EXAMPLES[verb]}"
     parser.set_defaults(verb=verb)
     add = parser.add_argument
     if verb == "rollback":

@@ -1,10 +1,19 @@
-"""``dehyst query``: ask a running service for voltages, or for its status."""
+"""``dehyst query``: ask a running service for voltages, or for its status.
+
+  dehyst query 40                              # the voltage for 40 µm at rest
+  dehyst query 40 40.1 40.2 --model linear     # a trajectory, one sample time apart
+  dehyst query --from trajectory.csv --json    # columns y,v,a
+  dehyst query --status
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,23 +21,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dehyst.adaptive.types import FloatArray
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
     from dehyst.service.protocol.query import Trajectory
 
-EPILOG = """\
-  dehyst query 40                              # the voltage for 40 µm at rest
-  dehyst query 40 40.1 40.2 --model linear     # a trajectory, one sample time apart
-  dehyst query --from trajectory.csv --json    # columns y,v,a
-  dehyst query --status
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("y_um", nargs="*", type=float, help="desired displacements, µm, one sample time apart")
     add(
@@ -106,17 +107,14 @@ def _read(source: str) -> list[FloatArray]:
         text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise FieldError("--from", str(error), "a readable CSV file") from error
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    rows = []
-    for i, line in lines:
-        try:
-            rows.append([float(part) for part in line.split(",")])
-        except ValueError as error:
-            if rows or i != lines[0][0]:
-                raise FieldError(f"{source}, line {i}", repr(line), "numbers y[,v[,a]] in µm, µm/s, µm/s²") from error
-    widths = {len(row) for row in rows}
-    if len(widths) != 1 or not widths <= {1, 2, 3}:
-        raise FieldError(
-            source, f"rows of {sorted(widths)} columns", "one to three columns y[,v[,a]], the same in all rows"
-        )
-    return [column.copy() for column in np.array(rows).T]
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if lines and not re.match(r"\s*[-+.\d]", lines[0]):
+        del lines[0]  # the names of the columns
+    try:
+        columns = np.loadtxt(lines, delimiter=",", ndmin=2, unpack=True) if lines else np.empty((0, 0))
+        if not 1 <= len(columns) <= 3:
+            raise ValueError(f"{columns.shape[1]} rows of {len(columns)} columns")
+    except ValueError as error:
+        expected = "one to three columns y[,v[,a]] of numbers in µm, µm/s, µm/s², the same in all rows"
+        raise FieldError(source, str(error), expected) from error
+    return [column.copy() for column in columns]

@@ -1,22 +1,5 @@
-"""``dehyst replay``: run the learner over a recording, offline, to see what it would do live."""
+"""``dehyst replay``: run the learner over a recording, offline, to see what it would do live.
 
-from __future__ import annotations
-
-import argparse
-import json
-import time
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
-from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
-from dehyst.service.protocol.errors import FieldError
-
-if TYPE_CHECKING:
-    from dehyst.service.config.learner import LearnerSettings
-
-EPILOG = """\
 For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
 block. Errors are of the voltage for the measured motion: in V, in percent of the voltage span of identification, and in
 µm by the mean gain. The code is the same as live, and so are the snapshots.
@@ -29,12 +12,29 @@ The configuration is that of 'dehyst serve', or the learner's settings alone (do
 
   dehyst replay recordings/x --config serve.toml --out out/replay
   dehyst replay test.csv --config learner.toml --model stage.npz --sensor-late 1 --out out/replay
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
 """
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dehyst.service.cli.options import add_shared, check_number, progress_printer
+from dehyst.service.identification.recording_options import add_mapping_arguments, describe, load
+from dehyst.service.protocol.errors import FieldError
+
+if TYPE_CHECKING:
+    from dehyst.service.config.learner import LearnerSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst replay``."""
-    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("data", type=Path, metavar="RECORDING", help="the recording: a file, or a folder of segments")
     add("--config", type=Path, required=True, metavar="FILE", help="TOML of 'dehyst serve', or of the learner alone")
@@ -42,14 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--model", type=Path, metavar="MODEL.npz", help="model to start from (the configuration's)")
     add("--learn", metavar="NAME", help="which model of the file learns (the configuration's, or lssvm_adaptive)")
     add_shared(parser, "range")
-    add("--age", type=float, metavar="S", help="age of the model when its answer takes effect, s (0.06)")
-    add(
-        "--window",
-        type=float,
-        default=0.5,
-        metavar="S",
-        help="window of the mean error in the picture, s (0.5)",
-    )
+    add("--age", type=float, default=0.06, metavar="S", help="age of the model when its answer takes effect, s (0.06)")
+    add("--window", type=float, default=0.5, metavar="S", help="window of the mean error in the picture, s (0.5)")
     add_shared(parser, "no-pictures", "quiet", "json")
     add_shared(parser, out={"required": True, "help": "folder for JSON, every decision, pictures and the model"})
     add_mapping_arguments(parser)
@@ -60,15 +54,14 @@ def run(args: argparse.Namespace) -> int:
     from dehyst.adaptive.inverse_model import LssvmInverse
     from dehyst.service.background.adoptions import read_adoptions
     from dehyst.service.config.learner import read_learner_settings
-    from dehyst.service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
+    from dehyst.service.replay import axis_config, draw_errors, draw_gates, replay, summary, write_gates
     from dehyst.service.server.axis_loading import load_axis
     from dehyst.service.server.learner_supervisor import standing_of
     from dehyst.service.storage.model_file import read_bundle, write_bundle
     from dehyst.service.storage.output import clear_output
 
     say = progress_printer(args.quiet)
-    if not args.window > 0.0:
-        raise FieldError("--window", args.window, "a time above 0 s")
+    check_number("--window", args.window, "s", low=0, above=True)
     found: LearnerSettings = read_learner_settings(args.config, args.axis)
     path = args.model if args.model is not None else found.axis.model if found.axis is not None else None
     if path is None:
@@ -87,16 +80,15 @@ def run(args: argparse.Namespace) -> int:
             say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
     clear_output(args.out)
     start = time.perf_counter()
-    shown = start
+    shown = [start]
 
     def progress(done: int, of: int) -> None:
-        nonlocal shown
         now = time.perf_counter()
-        if now - shown > 5.0 or done == of:
-            shown = now
+        if now - shown[-1] > 5.0 or done == of:
+            shown.append(now)
             say(f"  {done * axis.dt_s:.0f} of {of * axis.dt_s:.0f} s replayed in {now - start:.0f} s")
 
-    done: Replayed = replay(recording, axis, AGE_S if args.age is None else args.age, progress)
+    done = replay(recording, axis, args.age, progress)
     seconds = time.perf_counter() - start
     learnt = bundle.models[config.learn]
     span_V = learnt.span_V if isinstance(learnt, LssvmInverse) else 1.0
@@ -115,8 +107,6 @@ def run(args: argparse.Namespace) -> int:
     write_gates(args.out / "gates.csv", done)
     write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
     if not args.no_pictures:
-        from dehyst.service.replay import draw_errors, draw_gates
-
         draw_errors(args.out / "errors.png", f"{args.data.name}: predicted, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)
     print(json.dumps(numbers) if args.json else table(numbers, args.out))
@@ -132,13 +122,11 @@ def table(numbers: dict[str, Any], out: Path) -> str:
     ]
     for key, label in (("frozen", "as it was identified"), ("adaptive", "learning")):
         s = numbers[key]
-        if s["mae_V"] is None:
-            lines.append(f"{label:<30}nothing was scored")
-            continue
-        lines.append(
-            f"{label:<30}{1e3 * s['mae_V']:9.2f}{1e3 * s['rmse_V']:9.2f}{1e3 * s['max_V']:9.2f}{s['mae_pct']:9.3f}"
-            f"{s['rmse_um']:9.4f}"
-        )
+        errors = "nothing was scored"
+        if s["mae_V"] is not None:
+            errors = "".join(f"{1e3 * s[name]:9.2f}" for name in ("mae_V", "rmse_V", "max_V"))
+            errors += f"{s['mae_pct']:9.3f}{s['rmse_um']:9.4f}"
+        lines.append(f"{label:<30}{errors}")
     stated = numbers["within_stated_std"]
     lines.append(
         f"errors within one stated deviation: {100 * stated['one_std']:.1f} % (68.3 stated), "

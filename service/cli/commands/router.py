@@ -1,21 +1,21 @@
-"""``dehyst router``: forward messages between stages, services and clients on several hosts (docs/scale.md)."""
+"""``dehyst router``: forward messages between stages, services and clients on several hosts (docs/scale.md).
+
+Several hosts: docs/scale.md.
+
+  dehyst router --listen tcp/127.0.0.1:7450
+  dehyst router --listen tls/0.0.0.0:7447 --zenoh-config access/r1.json5    # see 'dehyst access --help'
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 
-from dehyst.service.cli.options import add_epilog, add_shared
-
-EPILOG = """\
-  dehyst router --listen tcp/127.0.0.1:7450
-  dehyst router --listen tls/0.0.0.0:7447 --zenoh-config access/r1.json5    # see 'dehyst access --help'
-"""
+from dehyst.service.cli.options import add_shared
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--listen", action="append", metavar="ENDPOINT", help="listen here; repeatable (tcp/127.0.0.1:7447)")
     add("--connect", action="append", default=[], metavar="ENDPOINT", help="another router; repeatable")

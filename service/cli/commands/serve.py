@@ -1,17 +1,25 @@
-"""``dehyst serve``: the serving process."""
+"""``dehyst serve``: the serving process.
+
+All keys of the configuration: docs/configuration.md.
+
+  dehyst serve --example > serve.toml    # then set model file and limits
+  dehyst serve --config serve.toml
+  dehyst serve --config serve.toml --standby
+
+'dehyst stage --examples DIR' makes a folder with the files that these examples name.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_shared
 from dehyst.service.config.settings import ServeConfig, read_config
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.descriptors import need_descriptors
@@ -21,16 +29,7 @@ from dehyst.service.security.access import has_access_control
 from dehyst.service.security.refusals import count_refusals
 
 if TYPE_CHECKING:
-    from dehyst.service.runtime.stopping import StopSignal
     from dehyst.service.server.process import Service
-
-EPILOG = """\
-All keys of the configuration: docs/configuration.md.
-
-  dehyst serve --example > serve.toml    # then set model file and limits
-  dehyst serve --config serve.toml
-  dehyst serve --config serve.toml --standby
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "insecure-beyond-loopback", "duration")
     add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
-    add_epilog(parser, EPILOG, files=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,8 +72,10 @@ def run(args: argparse.Namespace) -> int:
         with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
             started()
             _print_ready(service.ready(), args.json)
-            quiet = args.quiet or args.json
-            reason = _wait(stop, args.duration, lambda: None if quiet else print(summary(service), flush=True))
+            for _ in stop.every(SUMMARY_S, args.duration):
+                if not (args.quiet or args.json):
+                    print(summary(service), flush=True)
+            reason = stop.wait(0.0)
             statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
         print(json.dumps({"stopped": reason, "axes": statuses}, default=str), flush=True)
@@ -116,17 +116,6 @@ def _run_fleet(config: ServeConfig, args: argparse.Namespace, started: Callable[
 
 #: Period of the line that says how it goes, s.
 SUMMARY_S: Final = 60.0
-
-
-def _wait(stop: StopSignal, duration_s: float | None, say: Callable[[], None]) -> str:
-    """Wait for a signal or for ``duration_s``, with ``say`` every minute; returns the reason."""
-    until = math.inf if duration_s is None else time.monotonic() + duration_s
-    while True:
-        rest_s = until - time.monotonic()
-        reason = stop.wait(min(SUMMARY_S, rest_s))
-        if stop.reason or rest_s <= SUMMARY_S:
-            return reason
-        say()
 
 
 def summary(service: Service) -> str:

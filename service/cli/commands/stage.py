@@ -1,4 +1,13 @@
-"""``dehyst stage``: a simulated stage as a process on zenoh."""
+"""``dehyst stage``: a simulated stage as a process on zenoh.
+
+The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
+Where a voltage is late, the stage repeats the last one and counts it. The last line printed is JSON: ticks, late
+ticks, and per axis the samples published and the commands received, late, missing and refused.
+
+  dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
+  dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
+  dehyst stage --examples .              # write the files that the examples of all commands name, and exit
+"""
 
 from __future__ import annotations
 
@@ -9,26 +18,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from dehyst.service.cli.options import add_epilog, add_shared
+from dehyst.service.cli.options import add_shared, check_number
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from dehyst.service.runtime.stopping import StopSignal
 from dehyst.sim.stage.config import ParameterChange, StageConfig
 
-EPILOG = """\
-The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
-Where a voltage is late, the stage repeats the last one and counts it. The last line printed is JSON: ticks, late
-ticks, and per axis the samples published and the commands received, late, missing and refused.
-
-  dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
-  dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
-  dehyst stage --examples .              # write the files that the examples of all commands name, and exit
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst stage``."""
-    add_epilog(parser, EPILOG)
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--preset", default="rich", help="rich (default: stands in for hardware) or bouc_wen")
     what.add_argument("--file", type=Path, metavar="STAGE.toml", help="a stage file in place of a preset")
@@ -46,22 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--batch", type=int, default=1, metavar="N", help="samples in a message; more for a slow network (%(default)s)")
     add_shared(parser, "duration", seed={"default": None, "help": "seed of its noise and drift (the stage's own)"})
     add("--free-run", action="store_true", help="start at once, at 0 V until commands come")
-    add(
-        "--change",
-        action="append",
-        default=[],
-        metavar="T:NAME=VALUE[,...]",
-        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; repeatable",
-    )
+    add("--change", action="append", default=[], metavar="T:NAME=VALUE[,...]",
+        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; repeatable")  # fmt: skip
     add("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (%(default)s)")
     add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
-    add(
-        "--lock-step",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="let the clock stand still until a voltage comes, for at most so long, s (0: it never waits)",
-    )
+    add("--lock-step", type=float, default=0.0, metavar="S",
+        help="let the clock stand still until a voltage comes, for at most so long, s (0: it never waits)")  # fmt: skip
     add("--examples", type=Path, metavar="DIR", help="write the files that the examples of --help name, and exit")
     add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
     add_shared(parser, "zenoh-config", "key", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
@@ -94,8 +82,7 @@ def stage_config(args: argparse.Namespace) -> StageConfig:
 
         config = preset(args.preset)
     if args.rate is not None:
-        if not (math.isfinite(args.rate) and args.rate > 0.0):
-            raise FieldError("--rate", args.rate, "a positive sample rate in Hz")
+        check_number("--rate", args.rate, "Hz", low=0, above=True)
         config = replace(config, dt_s=1.0 / args.rate)
     if args.seed is not None:
         config = replace(config, seed=args.seed)
@@ -114,8 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
     stop = StopSignal(raising=True)
     config = stage_config(args)
-    if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0.0):
-        raise FieldError("--duration", args.duration, "a positive time in s")
+    check_number("--duration", args.duration, "s", low=0, above=True)
     twins = [name.strip() for name in args.twins.split(",") if name.strip()]
     node_config = NodeConfig(
         stage=config,
@@ -159,11 +145,11 @@ def run(args: argparse.Namespace) -> int:
 
 def write_example_files(folder: Path) -> int:
     """Write them and print what is what. Returns 0. Raises InputError where the folder cannot be written to."""
-    from dehyst.service.stage_node.example_files import write_examples
+    from dehyst.service.stage_node.example_files import FILES, write_examples
 
     try:
-        for name, text in write_examples(folder):
-            print(f"{name:<34}{text}")
+        write_examples(folder)
     except OSError as error:
         raise FieldError("--examples", f"{folder}: {error}", "a folder that can be written to") from error
+    print(*(f"{name:<16}{text}" for name, text in FILES.items()), sep="\n")
     return 0

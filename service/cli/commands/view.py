@@ -1,4 +1,11 @@
-"""``dehyst view``: stream a running service to the Rerun viewer or into an .rrd file."""
+"""``dehyst view``: stream a running service to the Rerun viewer or into an .rrd file.
+
+What is drawn, and where in a file: docs/viewer.md.
+
+  dehyst view --spawn                           # a viewer on this machine
+  dehyst view --web                             # a page for a browser on this machine, without a display here
+  dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
+"""
 
 from __future__ import annotations
 
@@ -6,12 +13,12 @@ import argparse
 import json
 import logging
 import subprocess
-import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 from dehyst.adaptive.errors import InputError
-from dehyst.service.cli.options import add_connection, add_epilog, add_shared
+from dehyst.service.cli.options import add_connection, add_shared
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.runtime.session import open_client
 from dehyst.service.runtime.stopping import StopSignal
@@ -25,54 +32,26 @@ DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 #: Past that live plots show by default, s; a file shows all.
 LIVE_HISTORY_S = 30.0
 
-EPILOG = """\
-  dehyst view --spawn                           # a viewer on this machine
-  dehyst view --web                             # a page for a browser on this machine, without a display here
-  dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser, wait_s=10.0, timeout_s=None)
     add_shared(parser, "stage", axis={"help": "axis that the service serves and learns from (%(default)s)"})
     add("--model", default="lssvm_adaptive", help="model that steers the axis; names its curves (%(default)s)")
-    add(
-        "--twin",
-        action="append",
-        default=[],
-        metavar="NAME=MODEL",
-        help="another axis of the stage, steered by MODEL, to compare with; repeatable",
-    )
-    add(
-        "--change-at",
-        type=float,
-        action="append",
-        default=[],
-        metavar="S",
-        help="mark a change of the stage at this time of the stage, s; repeatable",
-    )
+    many: dict[str, Any] = {"action": "append", "default": []}
+    add("--twin", **many, metavar="NAME=MODEL", help="another axis, steered by MODEL, to compare with; repeatable")
+    add("--change-at", **many, type=float, metavar="S", help="mark a change of the stage at this time, s; repeatable")
     add("--rrd", type=Path, metavar="FILE", help="write an .rrd, overwriting FILE")
-    add(
-        "--connect",
-        nargs="?",
-        const=DEFAULT_URL,
-        metavar="URL",
-        help=f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)",
-    )
+    at = f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)"
+    add("--connect", nargs="?", const=DEFAULT_URL, metavar="URL", help=at)
     add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays open")
     add("--web", action="store_true", help="serve Rerun's web viewer and stream to it; ends with this command")
     add("--port", type=int, default=9876, help="port of the started viewer, loopback only (%(default)s)")
     add("--web-port", type=int, default=9090, help="port of the page of --web, loopback only (%(default)s)")
     add("--range-um", type=float, metavar="UM", help="range for percentages, µm (span of the reference so far)")
-    add(
-        "--history",
-        type=float,
-        metavar="S",
-        help=f"past that the plots show, s; 0 for all (all in a file, {LIVE_HISTORY_S:g} live)",
-    )
+    past = f"past that the plots show, s; 0 for all (all in a file, {LIVE_HISTORY_S:g} live)"
+    add("--history", type=float, metavar="S", help=past)
     add("--batch", type=float, default=0.2, metavar="S", help="period of sending, s, 0.05 to 5 (%(default)s)")
     add_shared(parser, "duration", json={"help": "print the counts at the end as JSON"})
 
@@ -95,19 +74,18 @@ def run(args: argparse.Namespace) -> int:
     viewer: subprocess.Popen[bytes] | None = None
     try:
         with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
-            url = args.connect
+            url, name = args.connect, str(uuid.uuid4())
             if args.spawn or args.web:
                 from dehyst.service.viewer.rerun_sink import page_of, spawn_viewer
 
                 viewer, url = spawn_viewer(args.port, web_port=args.web_port if args.web else None)
                 if args.web:
                     print(f"open in a browser: {page_of(url, args.web_port)}", flush=True)
-            name = str(uuid.uuid4())
-            if args.rrd:
-                outputs.append(Output(OutputConfig(_scene(args, config, None), rrd=args.rrd, recording_id=name)))
-            if url:
-                scene = _scene(args, config, LIVE_HISTORY_S)
-                outputs.append(Output(OutputConfig(scene, connect=url, recording_id=name)))
+            for rrd, connect in ((args.rrd, None), (None, url)):
+                past_s = LIVE_HISTORY_S if connect and args.history is None else args.history or None
+                scene = SceneConfig(f"{args.stage}/{args.axis}", config.models, args.range_um, history_s=past_s)
+                if rrd or connect:
+                    outputs.append(Output(OutputConfig(scene, rrd, connect, name)))
             consumer = Consumer(session, config, outputs)
             try:
                 where = " and ".join(output.config.name for output in outputs)
@@ -115,55 +93,42 @@ def run(args: argparse.Namespace) -> int:
                 _wait(stop, args.duration, viewer, alone=args.rrd is None)
             finally:
                 consumer.close()
-        counts = dict(consumer.counts)
     finally:
         # A file gets all the time that a slow disk may need; a viewer may be gone.
-        finished = [(output.config, output.close(60.0 if output.config.rrd else 5.0)) for output in outputs]
+        cut_off = [output.config for output in outputs if not output.close(60.0 if output.config.rrd else 5.0)]
         if args.web and viewer is not None:
             viewer.terminate()
             viewer.wait(5.0)
-    lost_file = any(c.rrd and not ok for c, ok in finished)
-    drawn = all(ok for _, ok in finished)
+    counts = dict(consumer.counts)
     if args.json:
-        print(json.dumps({"schema": 1, "complete": drawn, "counts": counts}), flush=True)
+        print(json.dumps({"schema": 1, "complete": not cut_off, "counts": counts}), flush=True)
     else:
         lost = counts.get("dropped_batches", 0)
         print(f"{counts.get('samples', 0)} samples drawn, {lost} batches dropped", flush=True)
         if args.rrd:
             print(f"open it with: rerun {args.rrd}", flush=True)
-    for output_config, ok in finished:
-        if not ok:
-            log.warning("%s is incomplete: it did not take everything before the end", output_config.name)
-    return 1 if lost_file else 0
+    for output_config in cut_off:
+        log.warning("%s is incomplete: it did not take everything before the end", output_config.name)
+    return 1 if any(output_config.rrd for output_config in cut_off) else 0
 
 
 def twins(given: list[str]) -> tuple[tuple[str, str], ...]:
     """``NAME=MODEL`` pairs. Raises InputError naming the one that is not a pair."""
-    pairs = []
-    for text in given:
-        axis, sign, model = text.partition("=")
-        if not (axis and sign and model):
+    pairs = [text.partition("=") for text in given]
+    for text, (axis, _, model) in zip(given, pairs, strict=True):
+        if not (axis and model):
             raise InputError(f"twin: got {text!r}, expected NAME=MODEL such as x_linear=linear")
-        pairs.append((axis, model))
-    return tuple(pairs)
-
-
-def _scene(args: argparse.Namespace, config: ConsumerConfig, history_s: float | None) -> SceneConfig:
-    if args.history is not None:
-        history_s = args.history or None
-    return SceneConfig(f"{args.stage}/{args.axis}", config.models, range_um=args.range_um, history_s=history_s)
+    return tuple((axis, model) for axis, _, model in pairs)
 
 
 def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
     """Wait for a signal, the end of the time, or the end of the spawned viewer where there is no file (``alone``)."""
-    until = time.monotonic() + duration_s if duration_s is not None else float("inf")
-    while not stop.reason and time.monotonic() < until:
-        stop.wait(0.1)
-        if viewer is not None and viewer.poll() is not None:
-            if viewer.returncode != 0:
-                raise ServiceError(
-                    f"the viewer ended with status {viewer.returncode}: is there a display and a graphics driver, and "
-                    "is its port free? --web needs no display, --rrd FILE needs neither"
-                )
-            if alone:
-                return
+    for _ in stop.every(0.1, duration_s):
+        ended = None if viewer is None else viewer.poll()
+        if ended:
+            raise ServiceError(
+                f"the viewer ended with status {ended}: is there a display and a graphics driver, and is its port "
+                "free? --web needs no display, --rrd FILE needs neither"
+            )
+        if ended == 0 and alone:
+            return

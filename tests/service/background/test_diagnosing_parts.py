@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +29,10 @@ NORMAL = Levels(1.0, 0.0, 0.05, True)
 @pytest.mark.parametrize(
     ("now", "word"),
     [
-        (replace(NORMAL, gain=0.985), "gain"),
-        (replace(NORMAL, offset_V=0.3), "offset"),
-        (replace(NORMAL, error_pct=1.0), "error"),
-        (replace(NORMAL, valid=False), "validity"),
+        (NORMAL._replace(gain=0.985), "gain"),
+        (NORMAL._replace(offset_V=0.3), "offset"),
+        (NORMAL._replace(error_pct=1.0), "error"),
+        (NORMAL._replace(valid=False), "validity"),
     ],
 )
 def test_an_alarm_needs_to_last(now: Levels, word: str) -> None:

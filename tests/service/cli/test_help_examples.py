@@ -10,7 +10,6 @@ import contextlib
 import importlib
 import importlib.util
 import io
-import json
 import os
 import re
 import shlex
@@ -129,10 +128,9 @@ def test_look_runs_as_printed(folder: Path) -> None:
 
 def test_modes_run_as_printed(folder: Path) -> None:
     """The files hold modes at 90 and 230 Hz; two amplitudes show that one of them softens."""
-    amplitudes, columns, in_json = (run_as_printed(example, folder, "--no-pictures") for example in examples("modes"))
+    amplitudes, columns = (run_as_printed(example, folder, "--no-pictures") for example in examples("modes"))
     assert "softens by" in amplitudes
     assert " 90 Hz" in columns
-    assert [round(mode["frequency_hz"][0]) for mode in json.loads(in_json)["modes"]] == [90, 228]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -209,7 +210,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     for module in (adapter, rounds, mover, simulated_pi):
         monkeypatch.setattr(module, "time", clock)
     # The identification takes real time.
-    monkeypatch.setattr(rounds._Identification, "done", lambda self: self._process.wait() is not None)
+    hold = mover.Mover.hold
+
+    def hold_until(self: mover.Mover, done: Callable[[], bool]) -> None:
+        while not done():
+            time.sleep(0.02)
+        hold(self, done)
+
+    monkeypatch.setattr(mover.Mover, "hold", hold_until)
     return clock
 
 
@@ -323,7 +331,7 @@ def test_every_voltage_keeps_the_envelope_from_wherever_the_stage_rests(
     def fails(*_: object) -> None:
         raise StageFault("failed", "no identification here")
 
-    monkeypatch.setattr(rounds, "_Identification", fails)
+    monkeypatch.setattr(rounds, "_identified", fails)
     fault = faulty(stage, tmp_path, Order(limits))
     assert fault["message"] == "no identification here"
     kept_within(stage.written, limits, 50.0, rest_V)

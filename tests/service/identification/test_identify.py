@@ -141,7 +141,7 @@ def test_a_model_that_cannot_be_identified_does_not_take_the_others_along() -> N
         (("--support", "3"), "--support: got 3"),
         (("--stage", "My Rig"), "--stage: got 'My Rig'"),
         (("--column", "z=a"), "--column: got 'z=a'"),
-        (("--scale", "y=ten"), "--scale: got y=ten"),
+        (("--scale", "y=ten"), "--scale: got 'y=ten'"),
         (("--unit", "y=inch"), "unit of y: got 'inch'"),
         (("--column", "y=u_V", "--column", "u=y_um", "--scale", "u=1", "--scale", "y=1"), "look swapped"),
         (("--map", "none.toml"), "none.toml: cannot be read"),

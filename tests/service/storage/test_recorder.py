@@ -18,7 +18,7 @@ import pytest
 from dehyst.service.background.job import BackgroundJob
 from dehyst.service.storage import segments as recorder_files
 from dehyst.service.storage.recorder import ASIDE, Recorder, RecorderConfig
-from dehyst.service.storage.segments import Journal, Rows, read_journal, segments
+from dehyst.service.storage.segments import Journal, Rows, read_journal, rows_of, segments
 from dehyst.sim.recordings import check, read
 from tests.service.axes import loop_of
 from tests.service.storage.test_stored_files import make_axis
@@ -64,7 +64,7 @@ def test_what_was_put_is_read_back_to_the_last_bit_across_segments(tmp_path: Pat
 
 def written_rows(directory: Path) -> int:
     """Rows in the files of the open segments, as a killed process would leave them."""
-    return sum(len(read_journal(path)[0]) for path in directory.glob("*.journal"))
+    return sum(len(read_journal(path)) for path in directory.glob("*.journal"))
 
 
 def test_what_was_put_is_in_the_file_at_once_however_long_the_disk_takes(
@@ -125,9 +125,9 @@ def test_a_full_queue_drops_and_counts_and_never_blocks(tmp_path: Path, monkeypa
     hold = threading.Event()
     write = Journal.write
 
-    def slow(self: Journal, rows: Rows, index: np.ndarray) -> int:
+    def slow(self: Journal, rows: Rows) -> int:
         hold.wait(10.0)
-        return write(self, rows, index)
+        return write(self, rows)
 
     monkeypatch.setattr(Journal, "write", slow)
     recorder = Recorder(config(tmp_path, queue_samples=500))
@@ -224,17 +224,19 @@ def test_a_journal_cut_anywhere_keeps_its_whole_rows(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "segment-000001.journal")
     for k in range(3):
         seq, t_s, u_V, y_um = block(50 * k, 50)
-        journal.write(Rows(seq, t_s, u_V, y_um, ["learnt", f"word-{k}"] * 25), seq)
+        rows = rows_of(seq, t_s, u_V, y_um, ["learnt", f"word-{k}"] * 25)
+        rows["index"] = seq
+        journal.write(rows)
     journal.close()
     whole = journal.path.read_bytes()
     for cut in (len(whole), len(whole) - 1, len(whole) - 39, 16 + 40 * 30 + 7, 17, 16, 3, 0):
         path = tmp_path / f"segment-{100 + cut:06d}.journal"
         path.write_bytes(whole[:cut] + bytes(400))  # the disk may have been given more than was written
-        rows, index = read_journal(path)
+        rows = read_journal(path)
         assert len(rows) <= max(0, cut - 16) // 40
         assert len(rows) >= max(0, cut - 16) // 40 - 4  # and those that define words
-        assert index.tolist() == rows.seq.tolist() == list(range(len(rows)))
-        assert rows.reason == [("learnt", f"word-{k // 50}")[k % 2] for k in range(len(rows))]
+        assert rows["index"].tolist() == rows["seq"].tolist() == list(range(len(rows)))
+        assert rows["reason"].tolist() == [("learnt", f"word-{k // 50}")[k % 2] for k in range(len(rows))]
         made = recorder_files.convert(path)
         assert (0 if made is None else len(read(made, None))) == len(rows)
         assert not path.exists()

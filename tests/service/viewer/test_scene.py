@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
+from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.viewer import style
-from dehyst.service.viewer.consumer import ReferenceRing, SampleReferenceJoin
+from dehyst.service.viewer.consumer import ReferenceRing, Unit
 from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
 from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
 from dehyst.service.viewer.rerun_sink import cut, in_order
@@ -91,8 +92,9 @@ def data(plane: Plane, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
 @settings(deadline=None, max_examples=60)
 def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: list[Any], rng: Any) -> None:
     ring = ReferenceRing(size=256)
-    join = SampleReferenceJoin("linear", ring, patience_s=0.02)
+    unit = Unit("linear", ring)
     known: dict[int, float] = {}
+    surely: set[int] = set()
     taken: list[Tracking] = []
     now = 0
     for start, length, ahead in blocks:
@@ -102,18 +104,19 @@ def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: lis
             known |= {int(s): s * 2.0 for s in seq}
         n = rng.randint(1, 5)
         k = np.arange(now, now + n)
-        join.put(k, k * 1e-3, k * 0.1, k * 1.0)
+        unit.put(SampleBatch(k, k * 1e-3, k * 0.1, k * 1.0))
+        surely |= known.keys() & {*k.tolist()}
         now += n
-        taken += [t for t in [join.take()] if t is not None]
-    taken += [t for t in [join.take(everything=True)] if t is not None]
+        taken += [t for t in [unit.take()] if t is not None]
+    taken += [t for t in [unit.take(everything=True)] if t is not None]
     seq = np.concatenate([t.seq for t in taken])
     assert seq.tolist() == list(range(now))
     for part in taken:
         for s, u_V, reference_um in zip(part.seq, part.u_V, part.reference_um, strict=True):
             assert u_V == pytest.approx(s * 0.1)
+            assert int(s) not in surely or not math.isnan(reference_um)
             assert math.isnan(reference_um) or reference_um == known[int(s)]
-    # Whatever was known when its sample came is not lost.
-    assert join.take(everything=True) is None
+    assert unit.take(everything=True) is None
 
 
 # -- scene -------------------------------------------------------------------------------------------------------
