@@ -28,8 +28,13 @@ Displacements in µm, errors in percent of the commanded range.
   dehyst demo
   dehyst demo --fast --out out/fast
   dehyst demo --view                 # and watch it in the Rerun viewer
-  dehyst demo --mirror --duration 4  # a mirror of 1024 actuators, learnt as one batch (docs/fleet.md)
 """
+#: Options of earlier releases, with what does the same.
+_REMOVED = {
+    "ahead": "the controller follows its model; 'dehyst scenarios' asks the axis ahead",
+    "mirror": "a fleet learns many axes: serve one by the table [fleet], or call dehyst.adaptive.fleet (docs/fleet.md)",
+    "side": "the mirror that it was for is gone, see --mirror",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,15 +46,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--real-time", action="store_true", help="processes over zenoh, the stage at 1 kHz (default)")
     how.add_argument("--strict", action="store_true", help="the same, and the stage waits for no voltage")
     how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
-    how.add_argument("--mirror", action="store_true", help="a mirror of many actuators flattens a moving wavefront")
-    add("--side", type=int, default=32, help="actuators along each side of the mirror (%(default)s)")
     add_shared(
         parser,
         duration={"default": 60.0, "help": "length of the run after identification, s (%(default)s)"},
         stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
         seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
-    add("--ahead", action="store_true", help=argparse.SUPPRESS)
+    for gone in _REMOVED:
+        add(f"--{gone}", nargs="?", const=True, help=argparse.SUPPRESS)
     add("--view", action="store_true", help="also start the Rerun viewer and watch live (needs a display)")
     add("--connect", metavar="URL", help="also stream to a viewer that already runs, rerun+http://HOST:PORT/proxy")
     add_shared(parser, "quiet", json={"help": "print summary.json in place of the table"})
@@ -57,15 +61,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing was measured."""
-    if args.mirror:
-        return _run_mirror(args)
     from dehyst.lab.demo import session
 
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
         raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s; the table needs a settled part")
     check_seed(args.seed)
-    if args.ahead:
-        raise InputError("--ahead: removed, the controller follows its model; 'dehyst scenarios' asks the axis ahead")
+    for gone, instead in _REMOVED.items():
+        if getattr(args, gone) is not None:
+            raise InputError(f"--{gone}: removed; {instead}")
     if args.fast and (args.view or args.connect):
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
@@ -95,31 +98,6 @@ def _controlled(summary: dict[str, Any]) -> str:
         f"planned, {found['lost']} changes lost; "
         f"{found['extrapolated']} voltages from the reserve of an earlier block"
     )
-
-
-def _run_mirror(args: argparse.Namespace) -> int:
-    """Run the mirror. Returns 0."""
-    if not (math.isfinite(args.duration) and 1.5 <= args.duration <= 3600.0):
-        raise InputError(f"--duration: got {args.duration:g} s, expected 1.5 to 3600 s with --mirror")
-    check_seed(args.seed)
-    from dehyst.lab.demo import mirror
-    from dehyst.sim.mirror import MirrorConfig
-
-    say = progress_printer(args.quiet, StopSignal(raising=True).look)
-    config = MirrorConfig(side=args.side, seed=args.seed)
-    summary = mirror.run(args.out, config, args.duration, say)
-    if args.json:
-        print(json.dumps(summary))
-        return 0
-    for name, said in summary["surface_error"].items():
-        print(
-            f"{name:<11} {said['learnt_rms_nm']:6.1f} nm rms, worst actuator {said['worst_learnt_rms_nm']:.1f} nm; "
-            f"with actuator {summary['dead_actuator']} dead {said['dead_rms_nm']:.1f} nm, far from it "
-            f"{said['far_from_dead_rms_nm']:.1f} nm, at its place {said['at_dead_rms_nm']:.1f} nm"
-        )
-    print(f"troubles: {summary['troubles'] or 'none'}; a step of all axes takes {summary['step_ms']['median']:.1f} ms")
-    print(f"in {args.out}/: mirror.png (maps of the error), worst.png (errors over time), mirror.json")
-    return 0
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:

@@ -321,17 +321,14 @@ class _Reading:
 
     def _missing_time(self) -> list[MissingError]:
         """What is missing for the time, where other things are missing too."""
-        if self.main.dt_s is not None or self.main.clocks:
-            return []
         n = max((array.shape[0] for array in self.main.arrays.values() if array.ndim), default=0)
-        if n < 2:
-            return []
         try:
-            self._time(self.main.source, n, [])
+            if n > 1 and not self.main.clocks:
+                self._time(self.main.source, n, [])
         except MissingError as error:
             return [error]
         except InputError:
-            return []
+            pass
         return []
 
     def _column(self, quantity: str, *, needed: bool) -> FloatArray | None:
@@ -487,7 +484,7 @@ class _Reading:
         starts: list[tuple[str, float]] = []
         for quantity, name in self.names.items():
             table = self.by_quantity.get(quantity, self.main)
-            dt_s, start_s = table.clocks.get(name, (table.dt_s, None))
+            dt_s, start_s = table.clocks.get(name, (None, None))
             if dt_s is not None:
                 found.append((f"{name} of {table.source}", dt_s))
             if start_s is not None and quantity not in self.mapping.repeat:
@@ -500,7 +497,7 @@ class _Reading:
                     f"{where}: starts {round(start_s - starts[0][1], 6):+g} s after {starts[0][0]}, expected the same "
                     "start: cut them to the same times; or if the samples belong together, add --dt-s SECONDS"
                 )
-        if dt_s is not None and self.main.dt_s is None:
+        if dt_s is not None:
             self.notes.append(f"sample time {dt_s:g} s as the file states it")
         return dt_s
 
