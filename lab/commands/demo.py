@@ -19,7 +19,7 @@ log = logging.getLogger("dehyst.demo")
 EPILOG = """\
 In real time the demo runs these processes over zenoh on loopback: a simulated stage (five twins of one seed, one for
 each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, the
-viewer stream, and a bare paced loop for comparison. Each block of 5 ms is commanded one block ahead. If its voltages
+viewer stream. Each block of 5 ms is commanded one block ahead. If its voltages
 are late, the stage's clock stands still for up to 5 s: a busy machine makes the run longer and changes no voltage, and
 the end of the run says by how much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the
 stage holds the last voltage. --fast runs the same plan in one process and gives the same voltages.
@@ -33,6 +33,7 @@ Displacements in µm, errors in percent of the commanded range.
 _REMOVED = {
     "ahead": "the controller follows its model; 'dehyst scenarios' asks the axis ahead",
     "mirror": "a fleet learns many axes: serve one by the table [fleet], or call dehyst.adaptive.fleet (docs/fleet.md)",
+    "stage": "try the service on it: 'dehyst rehearse --plant STAGE.toml'",
     "side": "the mirror that it was for is gone, see --mirror",
 }
 
@@ -49,7 +50,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(
         parser,
         duration={"default": 60.0, "help": "length of the run after identification, s (%(default)s)"},
-        stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
         seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
     for gone in _REMOVED:
@@ -75,8 +75,7 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     say = progress_printer(args.quiet, StopSignal(raising=True).look)
     done = session.run(
-        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage,
-        strict=args.strict,
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, strict=args.strict,
     )  # fmt: skip
     if args.json:
         print(json.dumps(done.summary))
@@ -122,8 +121,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         f"samples: {samples['sent']} sent, {samples['received']} received, {samples['learnt']} learnt from",
         _controlled(summary),
         told(summary["raster"]),
-        f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
-        f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
+        f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time",
         *filter(None, [pace(summary), clock_missed(ticks)]),
         f"done in {seconds:.0f} s; in {out}/:",
         *(f"  {name:<16}{what}" for name, what in files.items()),

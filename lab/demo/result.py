@@ -112,7 +112,7 @@ class DemoRun:
     y_um, u_V, std_V : by model, (ticks,); the reading, the voltage applied, its standard deviation.
     query_s : durations of the evaluations of a block, s. followed : of the learning model, see `FollowedModels.counts`.
     samples : counts ``sent``, ``received``, ``learnt`` of the stage that the service learns from.
-    ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
+    ticks : counts ``count`` and ``late`` (no command in time).
     notes : records for the viewer (events, diagnostics, status), in order.
     pace : of a run with a clock, s: ``stage_s`` of the stage's time, ``ran_s`` that it took, and ``waited_s`` for which
     the stage's clock stood still. Empty without a clock.

@@ -25,7 +25,6 @@ from dehyst.lab.demo.plan import (
     UNITS,
     Plan,
     make_plan,
-    plan_for,
 )
 from dehyst.lab.demo.raster import ALONE, REPETITION, draw_raster, run_raster
 from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking
@@ -49,7 +48,7 @@ from dehyst.service.viewer.rerun_sink import write_recording
 from dehyst.sim.recordings import read, repaired
 from dehyst.sim.stage.stage import Stage
 
-# --- In real time or slower: stage, service, controller, viewer stream and a bare paced loop as processes over zenoh.
+# --- In real time or slower: stage, service, controller and viewer stream as processes over zenoh.
 
 
 #: A process may end so much later than planned, s.
@@ -70,22 +69,19 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         viewer = rig.start_viewer(rrd, STAGE, AXIS, plan.range_um, *view, *shown)
         where = ["--endpoint", rig.endpoint, "--twins", ",".join(twins.values())]
         stage = rig.start_stage(STAGE, AXIS, *where, *_stage_options(plan))
-        loop = rig.start_paced_loop(plan.dt_s, plan.ticks, wait=False)
         program = ["-m", "dehyst.lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
         controller = rig.start("controller", program, wait=False)
         _follow(controller, server, progress)
         if stage.wait(_OVERTIME_S) != 0:
             raise ServiceError(f"the stage failed: {stage.output_tail()}")
-        loop.wait(_OVERTIME_S)
         _wait_until_handled(rig.endpoint, plan)
         server.stop()
         viewer.stop(60.0)
-        return _collect(result, server, stage, loop)
+        return _collect(result, server, stage)
 
 
 def _stage_options(plan: Plan) -> list[str]:
     options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(plan.ticks * plan.dt_s)]
-    options += ["--file", plan.stage_file] if plan.stage_file else []
     options += ["--batch", str(plan.block)]
     options += [] if plan.strict else ["--lock-step", repr(LOCK_STEP_S)]
     for t_s, values in plan.stage(changing=True).changes:
@@ -120,7 +116,7 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
             time.sleep(0.05)
 
 
-def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
+def _collect(result: Path, server: Child, stage: Child) -> DemoRun:
     with np.load(result) as kept:
         y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
         query_s, followed = kept["query_s"], json.loads(str(kept["followed"]))
@@ -132,8 +128,6 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     ticks = {
         "count": summary["tick"],
         "late": max(unit["commands"]["missing"] for unit in units.values()),
-        "stage_late": summary["late"],
-        "bare_late": loop.last_json()["late"],
     }
     stage_s = summary["tick"] * summary["dt_s"]
     pace = {"stage_s": stage_s, "ran_s": summary["ran_s"], "waited_s": summary["waited_s"]}
@@ -182,7 +176,7 @@ class _Samples:
         """The run."""
         n, axis = self._plan.ticks, self._axis
         samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
-        ticks = {"count": n, "late": 0, "bare_late": 0}
+        ticks = {"count": n, "late": 0}
         durations = np.asarray(models.durations_s)
         return DemoRun(self.y_um, self.u_V, models.std_V, durations, samples, ticks, models.counts(), self.notes)
 
@@ -266,21 +260,16 @@ def run(
     seed: int,
     view: list[str],
     say: Say,
-    stage: Path | None = None,
     strict: bool = False,
 ) -> Done:
-    """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
-
-    ``strict`` : the stage's clock waits for no voltage.
+    """Run everything and write the results into ``out``. ``strict`` : the stage's clock waits for no voltage.
 
     Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
-    own = stage.resolve() if stage is not None else None
     clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
-    how = (duration_s, seed, strict)
-    plan = make_plan(*how) if own is None else plan_for(own, logs, *how)
+    plan = make_plan(duration_s, seed, strict)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
     _record(plan, out / "identification")
     say("[2/4] identifying five inverse models from 10 s at 1 kHz")

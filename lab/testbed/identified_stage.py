@@ -145,10 +145,4 @@ class Rig(Children):
     def start_echo(self, endpoint: str = "", *, wait: bool = True) -> Child:
         """A bare echo: it listens at ``endpoint``, or connects to the rig's own endpoint."""
         how = ["listen", endpoint] if endpoint else ["connect", self.endpoint]
-        return self.start("echo", ["-m", "dehyst.lab.testbed.processes", "echo", *how], wait=wait)
-
-    def start_paced_loop(self, step_s: float, ticks: int, *, wait: bool = True) -> Child:
-        """A bare paced loop, see `lab.testbed.processes`."""
-        return self.start(
-            "bare", ["-m", "dehyst.lab.testbed.processes", "paced_loop", str(step_s), str(ticks)], wait=wait
-        )
+        return self.start("echo", ["-m", "dehyst.lab.testbed.processes", *how], wait=wait)

@@ -14,7 +14,7 @@ from dehyst.service.protocol.errors import FieldError
 
 EPILOG = """\
 Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
-extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
+extended stage that `dehyst stage --file` and `dehyst rehearse --plant` run.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
 
   dehyst diagnose recording.parquet --out out/diagnosis
