@@ -79,13 +79,6 @@ def preset_tables(study: PresetStudy) -> Numbers:
             | {"third_family_mae_pct": run.third_mae_pct}
             for run in study.forward
         },
-        "table_2_4_inverse": {
-            run.model: {
-                "scores": {name: asdict(score) for name, score in run.scores.items()},
-                "third_family_mae_pct": run.third_mae_pct,
-            }
-            for run in study.replayed
-        },
         "hyper_parameters": hyper,
         "gains": {
             "ultimate_gain_V_per_um": control.ultimate.gain_V_per_um,
@@ -244,22 +237,19 @@ def models_section(ours: Numbers, theirs: Numbers, pictures: dict[str, str]) -> 
         "family is minor loops, a plain 5 Hz sine and random multi-tones; its column is the mean MAE over them.\n",
         images(pictures, "2.13", "2.14", "2.15"),
         "## What the chapter did not test\n",
-        _by_record({f"{run['label']}, {run['route']}": run["third_family"] for run in ours["table_2_4"].values()}),
+        _third_family(ours["table_2_4"]),
         images(pictures, "third"),
-        "## The same for inverse models, frozen and learning\n",
-        _by_record({LABELS[key]: entry["scores"] for key, entry in ours["table_2_4_inverse"].items()}),
-        "Each model answers the measured motion of a record with a voltage, whose error counts times the mean gain. "
-        "Learning models learn along the record, each voltage from a snapshot that is at least 40 ms old.\n",
     ]
 
 
-def _by_record(scores: dict[str, dict[str, Numbers]]) -> str:
+def _third_family(found: Numbers) -> str:
     """MAE by model and record."""
-    records = list(next(iter(scores.values())))
-    return table(
-        ["MAE, %", *records],
-        [[label, *(number(found[name]["mae_pct"]) for name in records)] for label, found in scores.items()],
-    )
+    records = list(next(iter(found.values()))["third_family"])
+    rows = [
+        [f"{run['label']}, {run['route']}", *(number(run["third_family"][name]["mae_pct"]) for name in records)]
+        for run in found.values()
+    ]
+    return table(["MAE, %", *records], rows)
 
 
 def _table_2_1(found: Numbers, theirs: Numbers) -> str:

@@ -20,7 +20,6 @@ from dehyst.baselines.bouc_wen.model import BoucWenParameters
 from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.baselines.swarm import SwarmConfig, swarm_bouc_wen, swarm_mpi
-from dehyst.sim.chapter import published
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
 from dehyst.sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs
 
@@ -202,8 +201,5 @@ def identify_forward(
         "mpi_lag", "MPI with a lag", "non-negative least squares", 21, lambda: identify_mpi(u, y, dt_s, fit_lag=True)[0]
     )
     add("lssvm", "LSSVM (u, du/dt)", "three-level inference", 2, lambda: fit_two_inputs(u, y))
-    given = published.FORWARD_HYPER
-    text = f"gamma {given[0]:g}, sigma {given[1]:g} given"
-    add("lssvm_given", "LSSVM (u, du/dt)", text, 2, lambda: fit_two_inputs(u, y, given))
     add("lssvm_memory", "LSSVM with memory", "prior and evidence", 6, lambda: fit_memory(data.training.u_V, y))
     return runs
