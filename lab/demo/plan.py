@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.signals.references import demo_reference
-from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.presets import preset
 
@@ -52,7 +51,7 @@ class Plan:
 
     Attributes
     ----------
-    dt_s : sample time, s. identify_s, run_s : lengths of the two parts, s.
+    dt_s : sample time, s. run_s : length after the identification, s.
     gain_change, payload_ratio : relative change of the stage's gain half way through; mass added over mass moved.
     low_um, high_um : range of the reference, µm.
     block, lead, margin : ticks per block, ticks that it is computed ahead, ticks left for samples and model to arrive.
@@ -64,7 +63,6 @@ class Plan:
     """
 
     dt_s: float = 0.001
-    identify_s: float = 10.0
     run_s: float = 60.0
     gain_change: float = -0.06
     payload_ratio: float = 1.0
@@ -113,10 +111,6 @@ class Plan:
             "catching_up": slice(self.change_tick + second, self.ticks - quiet),
             "settled": slice(self.ticks - quiet, self.ticks),
         }
-
-    def identification_voltage(self) -> FloatArray:
-        """The chapter's training input (2.37) at ``dt_s``, V."""
-        return training_input(self.dt_s, self.identify_s)[1]
 
     def reference(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Displacement µm, velocity µm/s, acceleration µm/s² of the reference, which is not in the training data."""

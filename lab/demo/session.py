@@ -13,7 +13,6 @@ from typing import Any, Final, cast
 import numpy as np
 import zenoh
 
-from dehyst.adaptive.errors import InputError
 from dehyst.lab.demo.controller import KEPT, FollowedModels
 from dehyst.lab.demo.plan import (
     AXIS,
@@ -29,23 +28,21 @@ from dehyst.lab.demo.plan import (
 from dehyst.lab.demo.raster import ALONE, REPETITION, draw_raster, run_raster
 from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking
 from dehyst.lab.loop import Twins, samples, turns
-from dehyst.lab.testbed.identified_stage import READY_S, Rig, write_service_config
+from dehyst.lab.testbed.identified_stage import READY_S, Rig, identify_stage, write_service_config
 from dehyst.lab.testbed.processes import Child
 from dehyst.service.client.client import Client
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.settings import read_config
-from dehyst.service.identification.identifying import NAMES, Stretch, identify_all
+from dehyst.service.identification.identifying import NAMES
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.protocol.model import encode_model
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.server.deltas import DeltaStreams
-from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from dehyst.service.storage.output import clear_output
 from dehyst.service.storage.recorder import Recorder, RecorderConfig
 from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Tracking
 from dehyst.service.viewer.rerun_sink import write_recording
-from dehyst.sim.recordings import read, repaired
 from dehyst.sim.stage.stage import Stage
 
 # --- In real time or slower: stage, service, controller and viewer stream as processes over zenoh.
@@ -270,14 +267,11 @@ def run(
     logs = out / "logs"
     logs.mkdir()
     plan = make_plan(duration_s, seed, strict)
-    say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
-    _record(plan, out / "identification")
-    say("[2/4] identifying five inverse models from 10 s at 1 kHz")
-    model = out / "model.npz"
-    _identify(plan, out / "identification", model, say)
+    say("[1/3] identifying five inverse models from 10 s of the chapter's training signal on a rested stage")
+    _identify(plan, out / "identification", out / "model.npz", say)
     live = "in real time" if strict else f"in real time, waiting up to {LOCK_STEP_S:g} s for each other"
     kind = "as fast as possible, in one process" if fast else f"in processes over zenoh, {live}"
-    say(f"[3/4] {plan.run_s:g} s of a reference that no model has seen, {kind}")
+    say(f"[2/3] {plan.run_s:g} s of a reference that no model has seen, {kind}")
     say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
     rig = Rig(logs)
     config = _configure(plan, out, logs / "serve.toml", rig.endpoint)
@@ -299,7 +293,7 @@ def run(
         write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
     else:
         done = run_live(plan, config, rig, out / "demo.rrd", view, progress)
-    say("[4/4] a raster on a rested stage, and the pictures")
+    say("[3/3] a raster on a rested stage, and the pictures")
     raster = run_raster(plan, {way: load_axis(STAGE, read_config(config).axes[0]) for way in (ALONE, REPETITION)})
     wanted_um = plan.reference()[0]
     summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time", "raster": raster.summary()}
@@ -310,40 +304,13 @@ def run(
     return Done(plan, done, summary)
 
 
-def _record(plan: Plan, folder: Path) -> None:
-    u_V, stage = plan.identification_voltage(), Stage(plan.stage(changing=False))
-    y_um, _ = stage.run(stage.initial_state(), u_V)
-    seq = np.arange(u_V.size)
+def _identify(plan: Plan, folder: Path, model: Path, say: Say) -> None:
+    """Identify the models on a rested stage; the recording that they come from goes into ``folder``."""
+    stage = plan.stage(changing=False)
+    found = identify_stage(stage, model, STAGE, AXIS, NAMES, TEACHER, lambda name: say(f"  {MODELS[name]} ..."))
+    seq = np.arange(found.u_V.size)
     with Recorder(RecorderConfig(folder)) as recorder:
-        recorder.put(seq, seq * plan.dt_s, u_V, y_um, "identification")
-
-
-def _identify(plan: Plan, data: Path, model: Path, say: Say) -> None:
-    recording = read(data)
-    whole = Stretch.of(repaired(recording))
-
-    def progress(name: str, phase: str, _share: float) -> None:
-        if phase == "fit":
-            say(f"  {MODELS[name]} ...")
-
-    results = identify_all(whole, whole, recording.dt_s, follows=False, progress=progress)
-    failed = [f"{result.name}: {result.failed}" for result in results if result.model is None]
-    if failed:
-        raise InputError(f"identification: {'; '.join(failed)}")
-    models = {result.name: result.model for result in results if result.model is not None}
-    assert set(models) == set(NAMES)
-    meta = BundleMeta(
-        stage=STAGE,
-        axis=AXIS,
-        dt_s=recording.dt_s,
-        source=data.name,
-        source_sha256=recording.sha256,
-        y_min_um=float(whole.motion[:, 0].min()),
-        y_max_um=float(whole.motion[:, 0].max()),
-        u_min_V=float(whole.u_V.min()),
-        u_max_V=float(whole.u_V.max()),
-    )
-    write_bundle(model, models, meta)
+        recorder.put(seq, seq * plan.dt_s, found.u_V, found.y_um, "identification")
 
 
 def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
