@@ -272,12 +272,6 @@ def goals(records: Sequence[Record]) -> str:
             f"{_percentiles(first * STEP_PCT / size_pct, 50, 95)} % ({_percentiles(first, 50, 95)} %)",
         ),
         (
-            f"step of the gain at once: samples until it is believed, median / 95 % of those of {len(steps)} that were "
-            "held back",
-            "≤ 14 / 20",
-            _percentiles(_numbers(record.get("believed_samples") for record in steps), 50, 95, digits=0),
-        ),
-        (
             "wrong readings (spikes and bursts), and jumps that were believed in these runs",
             "≤ 1 in 1000",
             _false_beliefs(intact),
