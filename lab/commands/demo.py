@@ -18,11 +18,11 @@ log = logging.getLogger("dehyst.demo")
 
 EPILOG = """\
 In real time the demo runs these processes over zenoh on loopback: a simulated stage (five twins of one seed, one for
-each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, the
-viewer stream. Each block of 5 ms is commanded one block ahead. If its voltages
-are late, the stage's clock stands still for up to 5 s: a busy machine makes the run longer and changes no voltage, and
-the end of the run says by how much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the
-stage holds the last voltage. --fast runs the same plan in one process and gives the same voltages.
+each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, and
+the viewer stream. Each block of 5 ms is commanded one block ahead. If its voltages are late, the stage's clock stands
+still for up to 5 s: a busy machine makes the run longer and changes no voltage, and the end of the run says by how
+much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the stage holds the last voltage.
+--fast runs the same plan in one process, without the viewer's file, and gives the same voltages.
 Displacements in µm, errors in percent of the commanded range.
 
   dehyst demo
@@ -109,10 +109,11 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         "tracking.png": "reference and errors over time",
         "loops.png": "what each model leaves of the hysteresis",
         "raster.png": "the error of lines of a raster, with and without repetition",
-        "demo.rrd": f"the whole run; open it with: rerun {out / 'demo.rrd'}",
         "recording/": f"the samples in Parquet; learn from them with: dehyst identify {out / 'recording'} --out m.npz",
         "identification/": "the recording that the models were identified from, and model.npz beside it",
     }
+    if summary["mode"] == "real_time":
+        files["demo.rrd"] = f"the whole run; open it with: rerun {out / 'demo.rrd'}"
     lines = [
         "",
         table(summary),

@@ -41,8 +41,6 @@ from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.server.deltas import DeltaStreams
 from dehyst.service.storage.output import clear_output
 from dehyst.service.storage.recorder import Recorder, RecorderConfig
-from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Tracking
-from dehyst.service.viewer.rerun_sink import write_recording
 from dehyst.sim.stage.stage import Stage
 
 # --- In real time or slower: stage, service, controller and viewer stream as processes over zenoh.
@@ -115,7 +113,7 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
 
 def _collect(result: Path, server: Child, stage: Child) -> DemoRun:
     with np.load(result) as kept:
-        y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
+        y_um = {name: kept[f"y_um/{name}"] for name in MODELS}
         query_s, followed = kept["query_s"], json.loads(str(kept["followed"]))
     result.unlink()
     summary = stage.last_json()
@@ -128,7 +126,7 @@ def _collect(result: Path, server: Child, stage: Child) -> DemoRun:
     }
     stage_s = summary["tick"] * summary["dt_s"]
     pace = {"stage_s": stage_s, "ran_s": summary["ran_s"], "waited_s": summary["waited_s"]}
-    return DemoRun(y_um, u_V, std_V, query_s, samples, ticks, followed, pace=pace)
+    return DemoRun(y_um, query_s, samples, ticks, followed, pace)
 
 
 # --- In one process, as fast as possible: the same models, queries and answers, without a network.
@@ -136,46 +134,6 @@ def _collect(result: Path, server: Child, stage: Child) -> DemoRun:
 
 #: Called with the number of ticks done and, by model, the mean absolute error of the last second, µm.
 Progress = Callable[[int, dict[str, float]], None]
-
-
-class _Samples:
-    """The twin stages of a fast run: drives them block by block, and hands the teacher's samples to ``axis``."""
-
-    def __init__(self, plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> None:
-        self._twins = Twins(Stage(plan.stage(changing=True)), tuple(MODELS), plan.ticks)
-        self.u_V, self.y_um = self._twins.u_V, self._twins.y_um
-        self.notes: list[Diagnostics] = []
-        self._plan, self._axis, self._recorder, self._progress = plan, axis, recorder, progress
-        self._wanted_um = plan.reference()[0]
-
-    def drive(self, block: int) -> None:
-        """Run the block with this number with its voltages in ``u_V``."""
-        plan, axis, size = self._plan, self._axis, self._plan.block
-        done = block * size
-        part = slice(done, done + size)
-        self._twins.run(part)
-        batch = samples(done, plan.dt_s, self.u_V[TEACHER][part], self.y_um[TEACHER][part])
-        verdicts = axis.handle(batch)
-        self._recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
-        if done % 100 == 0 and axis.learner is not None:
-            told = axis.learner.diagnostics()
-            if done % 1000:
-                told = {
-                    key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
-                }
-            self.notes.append(Diagnostics(float(batch.t_s[-1]), int(batch.seq[-1]), told))
-        if (done + size) % 1000 == 0:
-            tail = slice(max(0, done + size - 1000), done + size)
-            errors = {k: float(np.mean(np.abs(self._wanted_um[tail] - self.y_um[k][tail]))) for k in MODELS}
-            self._progress(done + size, errors)
-
-    def result(self, models: FollowedModels) -> DemoRun:
-        """The run."""
-        n, axis = self._plan.ticks, self._axis
-        samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
-        ticks = {"count": n, "late": 0}
-        durations = np.asarray(models.durations_s)
-        return DemoRun(self.y_um, self.u_V, models.std_V, durations, samples, ticks, models.counts(), self.notes)
 
 
 class _Loopback:
@@ -200,8 +158,8 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
 
     The teacher's samples go into ``axis``.
     """
-    driven = _Samples(plan, axis, recorder, progress)
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
+    twins, wanted_um = Twins(Stage(plan.stage(changing=True)), tuple(MODELS), n), plan.reference()[0]
     loopback, streams = _Loopback(), DeltaStreams(axis)
     streams.publish(TEACHER, loopback.put, lambda: True)
     streams.tick(0.0)
@@ -215,14 +173,23 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
     models = FollowedModels(plan, followers)
     for run, asked in turns(n // size, ahead):
         if run is not None:
-            driven.drive(run)
-            streams.tick((run + 1) * size * plan.dt_s)
+            part = slice(run * size, (run + 1) * size)
+            twins.run(part)
+            batch = samples(part.start, plan.dt_s, twins.u_V[TEACHER][part], twins.y_um[TEACHER][part])
+            recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, axis.handle(batch))
+            streams.tick(part.stop * plan.dt_s)
+            if part.stop % 1000 == 0:
+                last = slice(part.stop - 1000, part.stop)
+                errors = {k: float(np.mean(np.abs(wanted_um[last] - y_um[last]))) for k, y_um in twins.y_um.items()}
+                progress(part.stop, errors)
         if asked is not None:
             for name, begin, u_V in models.constant(asked * size):
-                driven.u_V[name][begin : begin + u_V.size] = u_V
+                twins.u_V[name][begin : begin + u_V.size] = u_V
             begin, u_V = models.block(asked, asked, asked + 1)
-            driven.u_V[TEACHER][begin : begin + u_V.size] = u_V
-    return driven.result(models)
+            twins.u_V[TEACHER][begin : begin + u_V.size] = u_V
+    counts = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
+    ticks = {"count": n, "late": 0}
+    return DemoRun(twins.y_um, np.asarray(models.durations_s), counts, ticks, models.counts())
 
 
 Say = Callable[[str], None]
@@ -290,7 +257,6 @@ def run(
         axis = load_axis(STAGE, read_config(config).axes[0])
         with Recorder(RecorderConfig(out / "recording")) as recorder:
             done = run_fast(plan, axis, recorder, progress)
-        write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
     else:
         done = run_live(plan, config, rig, out / "demo.rrd", view, progress)
     say("[3/3] a raster on a rested stage, and the pictures")
@@ -331,20 +297,3 @@ def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
     }
     write_service_config(path, STAGE, axis, listen=[endpoint])
     return path
-
-
-def _scene(plan: Plan) -> SceneConfig:
-    models = (TEACHER, *(name for name in MODELS if name != TEACHER))
-    return SceneConfig(f"{STAGE}/{AXIS}", models, range_um=plan.range_um)
-
-
-def _records(plan: Plan, done: DemoRun) -> list[Record]:
-    seq = np.arange(plan.ticks)
-    t_s = seq.astype(np.float64) * plan.dt_s
-    wanted_um = plan.reference()[0]
-    records: list[Record] = [
-        Tracking(name, seq, t_s, done.u_V[name], done.y_um[name], wanted_um, done.std_V[name]) for name in MODELS
-    ]
-    at = plan.change_tick
-    records.append(Event(at * plan.dt_s, at, f"the stage changes: {plan.change_text}", "WARN", change=True))
-    return records + list(done.notes)
