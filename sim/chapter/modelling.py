@@ -121,7 +121,7 @@ class ForwardRun:
     key, label, route : short name, name for people, and method of identification.
     parameters : number of identified parameters. seconds : duration of the identification, s.
     training, generalisation : scores on (2.37) and (2.45). third : by record of the third family.
-    training_um, generalisation_um : model outputs at the 0.02 s samples, µm.
+    generalisation_um : model outputs on (2.45) at the 0.02 s samples, µm.
     """
 
     key: str
@@ -133,7 +133,6 @@ class ForwardRun:
     training: Score
     generalisation: Score
     third: dict[str, Score]
-    training_um: FloatArray
     generalisation_um: FloatArray
 
     @property
@@ -158,11 +157,11 @@ def judge(
         out = predict(model, record.u_V)
         return Score.of(out - record.coarse_y_um, data.range_um), out
 
-    training, training_um = of(data.training)
+    training, _ = of(data.training)
     generalisation, generalisation_um = of(data.generalisation)
     third = {record.name: of(record)[0] for record in data.third}
     identified = key, label, route, model, parameters, seconds
-    return ForwardRun(*identified, training, generalisation, third, training_um, generalisation_um)
+    return ForwardRun(*identified, training, generalisation, third, generalisation_um)
 
 
 def identify_forward(

@@ -79,8 +79,6 @@ class Run:
     reference_um: FloatArray
     y_um: FloatArray
     u_V: FloatArray
-    feedforward_V: FloatArray
-    feedback_V: FloatArray
 
     @property
     def error_um(self) -> FloatArray:
@@ -129,7 +127,7 @@ def track(
             raise InputError(f"{name}: got a sample time of {other.dt_s} s, expected that of the stage, {dt_s} s")
     state, fed = stage.initial_state(), PIDState()
     low, high = stage.config.u_min_V, stage.config.u_max_V
-    y, u, forward, feedback = np.empty(n), np.empty(n), np.zeros(n), np.zeros(n)
+    y, u, forward = np.empty(n), np.empty(n), np.zeros(n)
     snapshots = deque([first], maxlen=config.delay_blocks)
     memory = None if first is None else first.rest_memory(0.0)
     block = n if online is None else config.block
@@ -145,8 +143,7 @@ def track(
         else:
             for k in range(part.start, part.stop):
                 y[k] = stage.read(state)[0]
-                feedback[k] = pid.step(fed, float(reference.y_um[k]) - y[k])
-                wanted = float(forward[k]) + feedback[k]
+                wanted = float(forward[k]) + pid.step(fed, float(reference.y_um[k]) - y[k])
                 u[k] = min(max(wanted, low), high)
                 fed.limit(wanted, float(u[k]))
                 stage.step(state, float(u[k]))
@@ -154,7 +151,7 @@ def track(
             for k in range(part.start, part.stop):
                 online.handle(Sample(k, k * dt_s, float(u[k]), float(y[k])))
             snapshots.append(online.snapshot())
-    return Run(np.arange(n, dtype=np.float64) * dt_s, reference.y_um, y, u, forward, feedback)
+    return Run(np.arange(n, dtype=np.float64) * dt_s, reference.y_um, y, u)
 
 
 @dataclass(frozen=True, slots=True)
