@@ -125,6 +125,18 @@ def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
     return record | given
 
 
+def test_healthy_runs_are_counted_and_each_that_is_not_well_is_told() -> None:
+    trouble = [{"name": "sensor_frozen", "named_s": 7.0}]
+    said = foreign.healthy_table(
+        [healthy_run(1), healthy_run(2, troubles=trouble, mean_pct=0.15), {"seed": 3, "block": 5, "failed": "E: no"}]
+    ).splitlines()
+    assert said[0].startswith("healthy: 3 stages, 1 failed, 1.00 h; false troubles 1 (sensor_frozen 1); 0 above 5 %")
+    assert "median / 95 %: 0.100 / 0.145" in said[0]
+    assert "TROUBLE sensor_frozen at 7.00 s" in said[1]
+    assert said[2].startswith("seed 3")
+    assert len(said) == 3
+
+
 def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foreign, "HEALTHY_S", (8.0, 8.0))
     file = tmp_path / "healthy.jsonl"
