@@ -24,15 +24,12 @@ other runs whether something is named. A row is one of these numbers over a grou
 Chance
 ------
 All cases run again with other noise of the sensor (of a record: begun some samples later), the learner as it is. The
-rms of the logarithms of the errors' ratios is what chance does to a case (half of it from all cases of its group, as
-two repetitions say little). The logarithms of a variant's ratios are divided by that, cut at ``CUT``, and summed over
-the cases of a row; the sum over the root of their number is normal for a variant that does what other noise does. A
-row is worse where this exceeds the quantile of ``LEVEL`` divided by all comparisons of the run (Bonferroni: a run in
-which nothing matters lists something with a probability of at most ``LEVEL``, as far as other noise is a measure of
-chance), and the geometric mean grows by ``LEAST`` too; or where the verdict gets worse in ``FLIPS`` cases more than it
-gets better, and in more than it does by other noise. The table says how many rows other noise alone makes worse by
-this rule. The learner is deterministic: equal numbers are equal for sure. Where no row is worse, but a single case is
-by more than ``CUT`` times what chance does to it, or a verdict is, it is open what the rule is worth: run more cases.
+rms of the logarithms of the errors' ratios over the cases of a row is what chance does to one of them. The logarithms
+of a variant's ratios are divided by that, cut at ``CUT``, and summed over the cases; the sum over the root of their
+number is normal for a variant that does what other noise does. A row is worse where this exceeds the quantile of
+``LEVEL`` divided by all comparisons of the run (Bonferroni), and the geometric mean grows by ``LEAST`` too; or where
+the verdict gets worse in ``FLIPS`` cases more than it gets better, and in more than it does by other noise. The learner
+is deterministic: equal numbers are equal for sure.
 """
 
 from __future__ import annotations
@@ -597,18 +594,10 @@ def flips(one: ByCase, other: ByCase, names: Sequence[str], measure: str) -> int
     return sum(verdict(one[name], measure) - verdict(other[name], measure) for name in names)
 
 
-def chance(base: ByCase, repeated: Sequence[ByCase], names: Sequence[str], measure: str) -> FloatArray:
-    """(n,) what chance does to a logarithm: half from the case itself, half from all cases."""
-    squares = np.mean([logs(one, base, names, measure) ** 2 for one in repeated], axis=0)
-    found: FloatArray = np.sqrt(0.5 * squares + 0.5 * squares.mean())
-    return np.maximum(found, LEAST_CHANCE)
-
-
 def worse_rows(
-    variant: ByCase, base: ByCase, repeated: Sequence[ByCase], groups: Mapping[str, Sequence[str]], comparisons: int,
-    sign: int = 1,
-) -> list[Row]:  # fmt: skip
-    """The rows in which a variant is worse than the learner as it is, beyond chance; ``sign`` -1: better.
+    variant: ByCase, base: ByCase, repeated: Sequence[ByCase], groups: Mapping[str, Sequence[str]], comparisons: int
+) -> list[Row]:
+    """The rows in which a variant is worse than the learner as it is, beyond chance.
 
     groups : names of the cases by group. comparisons : all that are made.
     """
@@ -616,37 +605,18 @@ def worse_rows(
     found = []
     for group, names in groups.items():
         for measure in FLOORS:
-            change = sign * logs(variant, base, names, measure)
-            if not change.any():
-                continue
-            scale = chance(base, repeated, names, measure)
+            change = logs(variant, base, names, measure)
+            by_noise = np.array([logs(one, base, names, measure) for one in repeated])
+            scale = max(float(np.sqrt(np.mean(by_noise**2))), LEAST_CHANCE)
             z = float(np.clip(change / scale, -CUT, CUT).sum()) / math.sqrt(len(names))
             by = math.exp(float(change.mean()))
             if z > limit and by >= LEAST:
                 found.append(Row(group, measure, by))
         for measure in VERDICTS:
-            more = sign * flips(variant, base, names, measure)
+            more = flips(variant, base, names, measure)
             by_chance = max((abs(flips(one, base, names, measure)) for one in repeated), default=0)
             if more >= FLIPS and more > by_chance:
                 found.append(Row(group, measure, more))
-    return found
-
-
-def worse_cases(
-    variant: ByCase, base: ByCase, repeated: Sequence[ByCase], groups: Mapping[str, Sequence[str]]
-) -> list[str]:
-    """Single cases that are worse by more than ``CUT`` times what chance does to them, or whose verdict is.
-
-    They make no row: other noise does that to a case now and then. But a rule that few cases need is not worth nothing.
-    """
-    found = []
-    for names in groups.values():
-        for measure in FLOORS:
-            change = logs(variant, base, names, measure)
-            far = change > np.maximum(CUT * chance(base, repeated, names, measure), math.log(LEAST))
-            found += [f"{names[k]}: {measure} × {math.exp(change[k]):.2f}" for k in np.flatnonzero(far)]
-        for measure in VERDICTS:
-            found += [f"{name}: {measure}" for name in names if flips(variant, base, [name], measure) > 0]
     return found
 
 
@@ -657,7 +627,7 @@ def different(variant: ByCase, base: ByCase) -> list[str]:
 
 # --- The table.
 
-HEAD = ("what", "value", "half / off", "twice", "better", "single cases that get worse")
+HEAD = ("what", "value", "half / off", "twice")
 
 
 @dataclass(frozen=True, slots=True)
@@ -674,22 +644,8 @@ class Results:
     def comparisons(self) -> int:
         return len(self.planned) * sum(len(FLOORS) for _ in self.groups)
 
-    def worse(self, name: str, sign: int = 1) -> list[Row]:
-        return worse_rows(self.variants[name], self.base, self.repeated, self.groups, self.comparisons, sign)
-
-    def single(self, name: str) -> list[str]:
-        return worse_cases(self.variants[name], self.base, self.repeated, self.groups)
-
-    def by_chance(self) -> str:
-        """What other noise alone makes worse by the same rules, each repetition judged by the others."""
-        rows = cases = seen = 0
-        for one in self.repeated:
-            others = [other for other in self.repeated if other is not one]
-            if others:
-                rows += len(worse_rows(one, self.base, others, self.groups, self.comparisons))
-                cases += len(worse_cases(one, self.base, others, self.groups))
-                seen += len(self.groups) * (len(FLOORS) + len(VERDICTS))
-        return f"{rows} of {seen} rows and {cases} single cases"
+    def worse(self, name: str) -> list[Row]:
+        return worse_rows(self.variants[name], self.base, self.repeated, self.groups, self.comparisons)
 
 
 def _told(results: Results, name: str) -> str:
@@ -705,8 +661,8 @@ def table(results: Results) -> str:
     for variant in results.planned:
         groups.setdefault(variant.of, []).append(variant)
     parts: dict[str, list[tuple[str, ...]]] = {
-        "changes nothing, to the last bit": [], "worth nothing: no row and no case gets worse beyond chance": [],
-        "open: single cases get worse, no row does": [], "worth its place": [],
+        "changes nothing, to the last bit": [], "worth nothing: no row gets worse beyond chance": [],
+        "worth its place": [],
     }  # fmt: skip
     kinds = list(parts)
     for of, variants in groups.items():
@@ -714,17 +670,13 @@ def table(results: Results) -> str:
         if not results.variants.keys() >= {*names}:
             continue
         cells = [_told(results, name) for name in names]
-        shifts = {name: f"{name.removeprefix(of).strip()} ".lstrip() for name in names}
-        better = [f"{shift}{row}" for name, shift in shifts.items() for row in results.worse(name, -1)]
-        single = [f"{shift}{text}" for name, shift in shifts.items() for text in results.single(name)]
-        line = (of, variants[0].value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single))
+        line = (of, variants[0].value, cells[0], *(cells[1:] or "-"))
         worth = any(results.worse(name) for name in names)
-        parts[kinds[0 if {*cells} == {"the same"} else 3 if worth else 2 if single else 1]].append(line)
+        parts[kinds[0 if {*cells} == {"the same"} else 2 if worth else 1]].append(line)
     cases = sum(len(names) for names in results.groups.values())
     texts = [
         f"{cases} cases ({', '.join(f'{len(names)} {group}' for group, names in results.groups.items())}), "
-        f"{len(results.variants)} of {len(results.planned)} variants; other noise alone makes {results.by_chance()} "
-        "worse by this rule"
+        f"{len(results.variants)} of {len(results.planned)} variants"
     ]
     for kind, lines in parts.items():
         if lines:

@@ -274,12 +274,6 @@ def goals(records: Sequence[Record]) -> str:
             f"{_percentiles(first * STEP_PCT / size_pct, 50, 95)} % ({_percentiles(first, 50, 95)} %)",
         ),
         (
-            f"step of the gain at once: samples until it is believed, median / 95 % of those of {len(steps)} that were "
-            "held back",
-            "≤ 14 / 20",
-            _percentiles(_numbers(record.get("believed_samples") for record in steps), 50, 95, digits=0),
-        ),
-        (
             "wrong readings (spikes and bursts), and jumps that were believed in these runs",
             "≤ 1 in 1000",
             _false_beliefs(intact),
@@ -375,44 +369,20 @@ def line(records: Sequence[Record]) -> str:
     )
 
 
-HEALTHY_HEAD = (
-    "sample rate, Hz", "stages", "failed", "hours", "false `trouble`", "per hour", "above 5 % for longer than 0.1 s",
-    "error after the start, median / 95 %",
-)  # fmt: skip
-
-
 def healthy_table(records: Sequence[Record]) -> str:
-    """Markdown: healthy runs by sample rate, and below it each run with a trouble or a large error."""
-    rates = sorted({_rate_Hz(record) for record in records if "stage" in record})
-    groups = [(f"{rate}", [r for r in records if "stage" in r and _rate_Hz(r) == rate]) for rate in rates]
-    rows = []
-    for name, part in (*groups, ("**all**", list(records))):
-        ended = [record for record in part if "failed" not in record]
-        false, hours = sum(len(record["troubles"]) for record in ended), _hours(ended)
-        rows.append(
-            (
-                name,
-                str(len(part)),
-                str(len(part) - len(ended)),
-                f"{hours:.2f}",
-                str(false),
-                f"{false / hours:.2f}" if hours else "-",
-                str(sum(record["figures"]["large_s"] > LARGE_S for record in ended)),
-                _percentiles(_numbers(record["mean_pct"] for record in ended), 50, 95) if ended else "-",
-            )
-        )
-    names = Counter(trouble["name"] for record in records for trouble in record.get("troubles", ()))
-    total = ", ".join(f"{name} {count}" for name, count in sorted(names.items())) or "none"
-    notable = [told(record) for record in sorted(records, key=lambda r: int(r["seed"])) if _notable(record)]
+    """What healthy runs came to, and below it each run that failed, or has a trouble or a large error."""
+    ended = [record for record in records if "failed" not in record]
+    names = Counter(trouble["name"] for record in ended for trouble in record["troubles"])
+    large = sum(record["figures"]["large_s"] > LARGE_S for record in ended)
     blocks = ", ".join(str(block) for block in sorted({record["block"] for record in records}))
-    return "\n".join(
-        [
-            markdown(HEALTHY_HEAD, rows),
-            "",
-            f"false troubles by name: {total}; answers know all samples but the last {blocks}",
-            *notable,
-        ]
+    said = (
+        f"healthy: {len(records)} stages, {len(records) - len(ended)} failed, {_hours(ended):.2f} h; false troubles "
+        f"{names.total()} ({', '.join(f'{name} {count}' for name, count in sorted(names.items())) or 'none'}); {large} "
+        f"above 5 % for longer than {LARGE_S:g} s; error after the start, median / 95 %: "
+        f"{_percentiles(_numbers(record['mean_pct'] for record in ended), 50, 95)}; answers know all samples but the "
+        f"last {blocks}"
     )
+    return "\n".join([said, *(told(record) for record in records if _notable(record))])
 
 
 def _rate_Hz(record: Record) -> int:

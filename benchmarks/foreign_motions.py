@@ -151,7 +151,6 @@ def run_motion(
                 "two_seconds": float(ratio.max()),
                 "two_seconds_at_s": float(np.argmax(ratio) * dt_s),
                 "troubles": troubles,
-                "noted": dict(Counter(event for _, event, _ in run.adaptive.events)),
                 "verdicts": dict(counts[0]),
                 "verdicts_after": dict(counts[1]),
                 "outside": float(np.mean(run.adaptive.flags[part] & OUTSIDE_DOMAIN > 0)),

@@ -21,7 +21,7 @@ import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,43 +44,24 @@ from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.reports import tables
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import Bundle, BundleMeta
+from dehyst.sim.recordings import ColumnMap, Recording, read
 
 # --- The records.
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Columns of a file. ``at`` : channel and realisation of a multisine, whose periods follow each other.
-
-    ``um`` : µm (or what stands for it) per unit of the displacement's column.
-    """
+    """A file, and what its columns mean."""
 
     path: str
-    u: str = "u_V"
-    y: str = "y_um"
-    at: tuple[int, int] | None = None
-    um: float = 1.0
+    mapping: ColumnMap = field(default_factory=ColumnMap)
 
-    def read(self, folder: Path) -> tuple[float, FloatArray, FloatArray]:
-        """Sample time, s, (n,) voltages and displacements. Raises OSError where the file is missing."""
+    def read(self, folder: Path) -> Recording:
+        """The recording. Raises FileNotFoundError where the file is missing."""
         path = folder / self.path
-        if path.suffix == ".npz":
-            with np.load(path) as file:
-                dt_s, columns = 1.0 / float(file["fs_hz"]), [file[self.u], file[self.y]]
-            if self.at is not None:
-                channel, realisation = self.at
-                columns = [column[:, channel, realisation].T.ravel() for column in columns]
-            u, y = (np.asarray(column, dtype=np.float64) for column in columns)
-        else:
-            if path.suffix == ".csv":
-                table: Any = np.genfromtxt(path, delimiter=",", names=True)
-            else:
-                import pyarrow.parquet as pq
-
-                table = pq.read_table(path)
-            t, u, y = (np.asarray(table[name], dtype=np.float64) for name in ("t_s", self.u, self.y))
-            dt_s = float(np.median(np.diff(t)))
-        return dt_s, u, y * self.um
+        if not path.exists():
+            raise FileNotFoundError(2, "missing", str(path))
+        return read(path, self.mapping)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,16 +78,23 @@ class Record:
     test: Source | None = None
 
 
+def _multisine(file: str, channel: int, realisation: int) -> Source:
+    """One channel and realisation, whose periods follow each other."""
+    index = dict.fromkeys(("u", "y"), f":,{channel},{realisation},*")
+    mapping = ColumnMap(columns={"u": "u", "rate": "fs_hz"}, units={"u": "V", "rate": "Hz"}, index=index)
+    return Source(f"fine_steering_mirror/fsm_{file}.npz", mapping)
+
+
 def _mirror(level: int, channel: int) -> Record:
-    train = Source(f"fine_steering_mirror/fsm_{level}mV_train.npz", "u", "y_um", (channel, 0))
     # There is no test file of the largest amplitude.
-    other, at = ("train", (channel, 1)) if level == 300 else ("test", (channel, 0))
-    test = Source(f"fine_steering_mirror/fsm_{level}mV_{other}.npz", "u", "y_um", at)
+    other, realisation = ("train", 1) if level == 300 else ("test", 0)
+    train, test = _multisine(f"{level}mV_train", channel, 0), _multisine(f"{level}mV_{other}", channel, realisation)
     return Record(f"mirror {level} mV, {channel}", train, (0.0, math.inf), (0.0, math.inf), test)
 
 
 def _benchmark(file: str) -> Source:
-    return Source(f"boucwen_benchmark/{file}.npz", "u_N", "y_m", um=1e6)
+    columns = {"u": "u_N", "y": "y_m", "rate": "fs_hz"}
+    return Source(f"boucwen_benchmark/{file}.npz", ColumnMap(columns=columns, scale={"u": 1.0, "rate": 1.0}))
 
 
 _STACK = [Source(f"picma_stack/{name}.csv") for name in ("model_sine_1hz", "test_ramped_sine_ff")]
@@ -162,10 +150,10 @@ class Cut:
         """Read and cut a record whose readings are ``late`` samples late. Raises OSError where a file is missing."""
         parts = []
         for source, (begin_s, end_s) in ((record.train, record.train_s), (record.test or record.train, record.test_s)):
-            dt_s, u, y = source.read(folder)
-            n = u.size - late
+            recording = source.read(folder)
+            dt_s, n = recording.dt_s, len(recording) - late
             begin, end = (round(min(at_s / dt_s, n)) for at_s in (begin_s, end_s))
-            parts.append((u[begin:end], y[late + begin : late + end]))
+            parts.append((recording.u_V[begin:end], recording.y_um[late + begin : late + end]))
         u_V, y_um = (np.concatenate(column) for column in zip(*parts, strict=True))
         return cls(dt_s, u_V, y_um, parts[0][0].size, record.test is not None, n - end)
 

@@ -22,7 +22,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "scenarios": _experiment("scenarios", "compare adapting with not adapting in every kind of drift"),
     "soak": _experiment("soak", "run all processes under a seeded schedule of faults, and check what must hold"),
     "bench": _experiment("bench", "measure the solver's speed and accuracy, from a checkout"),
-    "reproduce": _experiment("reproduce", "compute the chapter's tables and figures, beside its own numbers"),
+    "reproduce": _experiment("reproduce", "compute the chapter's tables, beside its own numbers"),
 }
 
 

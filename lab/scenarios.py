@@ -4,13 +4,13 @@ Both twins have the same stage, noise and reference, and both models begin as th
 chapter's training signal. The axis answers in blocks, queried ahead, from snapshots of a certain age, as for a
 controller in the network.
 
-`run_scenario` runs one scenario, `judge` judges it, `table` shows the verdicts.
+`run_scenario` runs one scenario, `judge` judges it, `table` shows the verdicts, `draw_course` draws one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -25,10 +25,10 @@ from dehyst.lab.rehearsal.outcome import moving_mean
 from dehyst.service.answers.guard import Limits
 from dehyst.service.config.settings import AxisConfig
 from dehyst.service.reports import tables
-from dehyst.service.reports.plot_style import MOST_POINTS, figure, legend, line, save
+from dehyst.service.reports.plot_style import figure, legend, line, save
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.model_file import Bundle, BundleMeta
-from dehyst.service.viewer.colours import DIAGNOSTIC, EVENT, LIMIT, REFERENCE, model_colour
+from dehyst.service.viewer.colours import EVENT, LIMIT, REFERENCE, model_colour
 from dehyst.sim.scenarios import Scenario
 from dehyst.sim.signals.voltages import training_input
 from dehyst.sim.stage.config import StageConfig
@@ -57,7 +57,6 @@ class ScenarioRecord:
     wanted_um : the reference. error_um : by model, reference minus reading without glitches.
     floor_um : rms noise of a reading at rest, of the stage at that sample.
     verdicts : counts of the learner's verdicts on samples. counters : of the learner, at the end.
-    gate : (n,) index into ``gates`` of the learner's verdict on each sample.
     """
 
     scenario: Scenario
@@ -66,8 +65,6 @@ class ScenarioRecord:
     floor_um: FloatArray
     verdicts: dict[str, int]
     counters: dict[str, int]
-    gates: tuple[str, ...] = ()
-    gate: Any = field(default=None, repr=False)
 
 
 @lru_cache(maxsize=64)
@@ -105,15 +102,12 @@ def run_scenario(
     twins = Twins(Stage(scenario.changing_stage()), MODELS, n)
     # The axis tracks the adaptive twin's stage; the other twin sends its memory along.
     ask = {name: Asker(axis, name, tracked=name == ADAPTIVE) for name in MODELS}
-    names: dict[str, int] = {}
-    gate = np.zeros(n, dtype=np.int16)
     for run, asked in turns(n // BLOCK, LEAD // BLOCK):
         if run is not None:
             part = slice(run * BLOCK, (run + 1) * BLOCK)
             twins.run(part)
             read = scenario.glitches.applied(part.start, twins.y_um[ADAPTIVE][part])
-            verdicts = axis.handle(samples(part.start, dt, twins.u_V[ADAPTIVE][part], read))
-            gate[part] = [names.setdefault(verdict, len(names)) for verdict in verdicts]
+            axis.handle(samples(part.start, dt, twins.u_V[ADAPTIVE][part], read))
             if part.stop % 1000 == 0:
                 progress(part.stop * dt)
         if asked is not None:
@@ -129,8 +123,6 @@ def run_scenario(
         floor_um=_floor(scenario, n),
         verdicts=axis.gates,
         counters=learner.counters() if learner is not None else {},
-        gates=tuple(names),
-        gate=gate,
     )
 
 
@@ -243,10 +235,10 @@ def judge(course: ScenarioRecord) -> Verdict:
     }
     ratio = float(w.ratio[worst])
     return Verdict(
-        name=s.name,
-        kind=s.kind,
-        seed=s.seed,
-        text=s.text,
+        s.name,
+        s.kind,
+        s.seed,
+        s.text,
         **errors,
         worst_ratio=ratio,
         worst_s=float(w.t_s[worst]),
@@ -284,17 +276,14 @@ def table(verdicts: list[Verdict], markdown: bool = False) -> str:
     return "\n".join(cells)
 
 
-# --- Pictures of scenarios: each one over time, and all of them against the allowed error.
-
-
 def draw_course(path: Path, course: ScenarioRecord, verdict: Verdict) -> None:
-    """Reference, errors, mean error and allowed error of every window, and the learner's answers to samples."""
+    """Reference, errors, and mean error and allowed error of every window."""
     s = course.scenario
     dt, percent = s.stage.dt_s, 100.0 / s.range_um
     t_s = np.arange(course.wanted_um.size) * dt
     title = f"{s.name}: {s.text}; {'held' if verdict.held else 'NOT held'}"
-    drawn, axes = figure(4, 1, (11.0, 9.5), title, sharex=True, height_ratios=(0.8, 1.2, 1.4, 0.8))
-    top, middle, bottom, gates = axes[:, 0]
+    drawn, axes = figure(3, 1, (11.0, 8.5), title, sharex=True, height_ratios=(0.8, 1.2, 1.4))
+    top, middle, bottom = axes[:, 0]
     line(top, t_s, course.wanted_um, color=REFERENCE, lw=0.6)
     top.set_ylabel("reference, µm")
     for name, front in ((FROZEN, 2), (ADAPTIVE, 3)):
@@ -312,40 +301,8 @@ def draw_course(path: Path, course: ScenarioRecord, verdict: Verdict) -> None:
     bottom.plot(verdict.worst_s, verdict.worst_pct, "v", color=EVENT, ms=6, label="closest to the limit")
     bottom.set_ylabel(f"mean |error| over {WINDOW_S:g} s,\n% of range")
     legend(bottom, ncols=2)
-    draw_gates(gates, course.gate, course.gates, t_s)
-    gates.set_xlabel("time, s")
-    for axis in (top, middle, bottom, gates):
+    bottom.set_xlabel("time, s")
+    for axis in (top, middle, bottom):
         axis.axvline(s.change_s, color=EVENT, lw=1.0, ls=":")
         axis.margins(x=0)
-    save(drawn, path)
-
-
-def draw_gates(axes: Any, gate: Any, names: tuple[str, ...], t_s: Any) -> None:
-    """One row per kind of answer of the learner, marked where it was given."""
-    order = sorted(range(len(names)), key=lambda i: names[i] in ("learnt", "passed"))
-    for row, index in enumerate(order):
-        at = np.flatnonzero(gate == index)
-        if at.size == 0:
-            continue
-        # At most one mark per bin.
-        bins = np.unique((at * MOST_POINTS) // max(1, gate.size)) if gate.size > MOST_POINTS else at
-        when = t_s[bins * gate.size // MOST_POINTS] if gate.size > MOST_POINTS else t_s[at]
-        axes.plot(when, np.full(when.size, row), "|", ms=6, color=DIAGNOSTIC)
-    axes.set_yticks(range(len(order)), [names[i] for i in order], fontsize=7)
-    axes.set_ylim(-0.7, len(order) - 0.3)
-
-
-def draw_overview(path: Path, verdicts: list[Verdict]) -> None:
-    """One bar per scenario: the error of its worst window relative to the allowed error."""
-    drawn, grid = figure(1, 1, (9.0, 1.2 + 0.28 * len(verdicts)))
-    axes = grid[0, 0]
-    ratios = [v.worst_ratio for v in verdicts]
-    colours = [model_colour(ADAPTIVE) if v.held else EVENT for v in verdicts]
-    bars = axes.barh(range(len(verdicts)), ratios, color=colours)
-    axes.bar_label(bars, labels=[f"{v.worst_ratio:.2f}" for v in verdicts], padding=3, fontsize=8)
-    axes.axvline(1.0, color="black", lw=1.0, ls="--")
-    axes.set_yticks(range(len(verdicts)), [f"{v.name}: {v.text}" for v in verdicts], fontsize=8)
-    axes.invert_yaxis()
-    axes.set_xlim(0.0, max(1.15, 1.12 * max(ratios, default=1.0)))
-    axes.set_xlabel(f"worst {WINDOW_S:g} s: adaptive error / allowed error")
     save(drawn, path)

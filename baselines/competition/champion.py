@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Final, Protocol, runtime_checkable
+from typing import Annotated, Any, Final
 
 import numpy as np
 
@@ -39,43 +39,10 @@ _SHARES_OFF: Final = 1e-6
 AdvanceMemory = Callable[[FloatArray, FloatArray, FloatArray], None]
 
 
-@runtime_checkable
-class AdvancesMemory(Protocol):
-    """An inverse model with a fast ``track``: in place and without checks."""
-
-    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """Advance ``memory`` (m,) in place over (n,) points with the voltages ``u_V``."""
-        ...
-
-
-@runtime_checkable
-class StatesValidity(Protocol):
-    """An inverse model that can declare itself unusable."""
-
-    @property
-    def valid(self) -> bool:
-        """Whether its answers can be used."""
-        ...
-
-
-def _memory_advance_of(model: InverseModel) -> AdvanceMemory:
-    """The function that advances the memory of ``model`` over answers of another model."""
-    if isinstance(model, AdvancesMemory):
-        return model.carry
-
-    def track(y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        still = np.zeros(np.asarray(y_um).size)
-        memory[:] = model.track(y_um, still, still, u_V, memory)
-
-    return track
-
-
-def _advances_but(
-    models: Sequence[InverseModel], parts: Sequence[slice], champion: int
-) -> tuple[tuple[AdvanceMemory, slice], ...]:
-    """The advance functions of all models with a memory except the champion, with their parts of the whole memory."""
+def _others_of(models: Sequence[Any], parts: Sequence[slice], champion: int) -> tuple[tuple[AdvanceMemory, slice], ...]:
+    """What advances the memories of all models that have one, except the champion's, and their parts of the whole."""
     return tuple(
-        (_memory_advance_of(model), part)
+        (model.carry, part)
         for i, (model, part) in enumerate(zip(models, parts, strict=True))
         if i != champion and part.stop > part.start
     )
@@ -108,7 +75,7 @@ class ChampionInverse:
 
     Parameters
     ----------
-    names, models : the contestants, in order; all models have one sample time.
+    names, models : the contestants, in order; all models have one sample time, and ``carry``, a `track` in place.
     champion : index of the contestant that answers.
     blend_s : duration of a change of champion in a caller's stream of points, s.
 
@@ -144,7 +111,7 @@ class ChampionInverse:
         object.__setattr__(self, "_ends", ends)
         object.__setattr__(self, "_settled_bytes", self._settled_weights().tobytes())
         parts = [slice(start, stop) for start, stop in itertools.pairwise(ends)]
-        object.__setattr__(self, "_others", _advances_but(self.models, parts, self.champion))
+        object.__setattr__(self, "_others", _others_of(self.models, parts, self.champion))
         object.__setattr__(self, "_champion_part", parts[self.champion])
         served = self.served
         object.__setattr__(self, "_packed", served.packed if type(served) is LssvmInverse else None)
@@ -167,8 +134,7 @@ class ChampionInverse:
     @property
     def valid(self) -> bool:
         """Whether the champion's answers can be used."""
-        served = self.served
-        return not isinstance(served, StatesValidity) or bool(served.valid)
+        return bool(getattr(self.served, "valid", True))
 
     def rest_memory(self, y_um: float) -> FloatArray:
         """(m,) memory of a stage at rest at ``y_um`` µm; the champion has all the weight."""
@@ -208,7 +174,7 @@ class ChampionInverse:
         for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
             end = answers[i].memory if i in answers else part.copy()
             if i not in answers and part.size:
-                _memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+                model.carry(np.ascontiguousarray(y_um, dtype=np.float64), u, end)  # type: ignore[attr-defined]
             ends.append(end if np.isfinite(end).all() else part)
         return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 

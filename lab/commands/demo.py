@@ -18,18 +18,24 @@ log = logging.getLogger("dehyst.demo")
 
 EPILOG = """\
 In real time the demo runs these processes over zenoh on loopback: a simulated stage (five twins of one seed, one for
-each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, the
-viewer stream, and a bare paced loop for comparison. Each block of 5 ms is commanded one block ahead. If its voltages
-are late, the stage's clock stands still for up to 5 s: a busy machine makes the run longer and changes no voltage, and
-the end of the run says by how much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the
-stage holds the last voltage. --fast runs the same plan in one process and gives the same voltages.
+each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, and
+the viewer stream. Each block of 5 ms is commanded one block ahead. If its voltages are late, the stage's clock stands
+still for up to 5 s: a busy machine makes the run longer and changes no voltage, and the end of the run says by how
+much. --strict keeps real time: 60 ms more are commanded in reserve, and after them the stage holds the last voltage.
+--fast runs the same plan in one process, without the viewer's file, and gives the same voltages.
 Displacements in µm, errors in percent of the commanded range.
 
   dehyst demo
   dehyst demo --fast --out out/fast
   dehyst demo --view                 # and watch it in the Rerun viewer
-  dehyst demo --mirror --duration 4  # a mirror of 1024 actuators, learnt as one batch (docs/fleet.md)
 """
+#: Options of earlier releases, with what does the same.
+_REMOVED = {
+    "ahead": "the controller follows its model; 'dehyst scenarios' asks the axis ahead",
+    "mirror": "a fleet learns many axes: serve one by the table [fleet], or call dehyst.adaptive.fleet (docs/fleet.md)",
+    "stage": "try the service on it: 'dehyst rehearse --plant STAGE.toml'",
+    "side": "the mirror that it was for is gone, see --mirror",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,15 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--real-time", action="store_true", help="processes over zenoh, the stage at 1 kHz (default)")
     how.add_argument("--strict", action="store_true", help="the same, and the stage waits for no voltage")
     how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
-    how.add_argument("--mirror", action="store_true", help="a mirror of many actuators flattens a moving wavefront")
-    add("--side", type=int, default=32, help="actuators along each side of the mirror (%(default)s)")
     add_shared(
         parser,
         duration={"default": 60.0, "help": "length of the run after identification, s (%(default)s)"},
-        stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
         seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
-    add("--ahead", action="store_true", help=argparse.SUPPRESS)
+    for gone in _REMOVED:
+        add(f"--{gone}", nargs="?", const=True, help=argparse.SUPPRESS)
     add("--view", action="store_true", help="also start the Rerun viewer and watch live (needs a display)")
     add("--connect", metavar="URL", help="also stream to a viewer that already runs, rerun+http://HOST:PORT/proxy")
     add_shared(parser, "quiet", json={"help": "print summary.json in place of the table"})
@@ -57,23 +61,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing was measured."""
-    if args.mirror:
-        return _run_mirror(args)
     from dehyst.lab.demo import session
 
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
         raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s; the table needs a settled part")
     check_seed(args.seed)
-    if args.ahead:
-        raise InputError("--ahead: removed, the controller follows its model; 'dehyst scenarios' asks the axis ahead")
+    for gone, instead in _REMOVED.items():
+        if getattr(args, gone) is not None:
+            raise InputError(f"--{gone}: removed; {instead}")
     if args.fast and (args.view or args.connect):
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
     say = progress_printer(args.quiet, StopSignal(raising=True).look)
     done = session.run(
-        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage,
-        strict=args.strict,
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, strict=args.strict,
     )  # fmt: skip
     if args.json:
         print(json.dumps(done.summary))
@@ -97,31 +99,6 @@ def _controlled(summary: dict[str, Any]) -> str:
     )
 
 
-def _run_mirror(args: argparse.Namespace) -> int:
-    """Run the mirror. Returns 0."""
-    if not (math.isfinite(args.duration) and 1.5 <= args.duration <= 3600.0):
-        raise InputError(f"--duration: got {args.duration:g} s, expected 1.5 to 3600 s with --mirror")
-    check_seed(args.seed)
-    from dehyst.lab.demo import mirror
-    from dehyst.sim.mirror import MirrorConfig
-
-    say = progress_printer(args.quiet, StopSignal(raising=True).look)
-    config = MirrorConfig(side=args.side, seed=args.seed)
-    summary = mirror.run(args.out, config, args.duration, say)
-    if args.json:
-        print(json.dumps(summary))
-        return 0
-    for name, said in summary["surface_error"].items():
-        print(
-            f"{name:<11} {said['learnt_rms_nm']:6.1f} nm rms, worst actuator {said['worst_learnt_rms_nm']:.1f} nm; "
-            f"with actuator {summary['dead_actuator']} dead {said['dead_rms_nm']:.1f} nm, far from it "
-            f"{said['far_from_dead_rms_nm']:.1f} nm, at its place {said['at_dead_rms_nm']:.1f} nm"
-        )
-    print(f"troubles: {summary['troubles'] or 'none'}; a step of all axes takes {summary['step_ms']['median']:.1f} ms")
-    print(f"in {args.out}/: mirror.png (maps of the error), worst.png (errors over time), mirror.json")
-    return 0
-
-
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
     from dehyst.lab.demo.raster import told
     from dehyst.lab.demo.result import clock_missed, pace, table
@@ -132,10 +109,11 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         "tracking.png": "reference and errors over time",
         "loops.png": "what each model leaves of the hysteresis",
         "raster.png": "the error of lines of a raster, with and without repetition",
-        "demo.rrd": f"the whole run; open it with: rerun {out / 'demo.rrd'}",
         "recording/": f"the samples in Parquet; learn from them with: dehyst identify {out / 'recording'} --out m.npz",
         "identification/": "the recording that the models were identified from, and model.npz beside it",
     }
+    if summary["mode"] == "real_time":
+        files["demo.rrd"] = f"the whole run; open it with: rerun {out / 'demo.rrd'}"
     lines = [
         "",
         table(summary),
@@ -144,8 +122,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         f"samples: {samples['sent']} sent, {samples['received']} received, {samples['learnt']} learnt from",
         _controlled(summary),
         told(summary["raster"]),
-        f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
-        f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
+        f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time",
         *filter(None, [pace(summary), clock_missed(ticks)]),
         f"done in {seconds:.0f} s; in {out}/:",
         *(f"  {name:<16}{what}" for name, what in files.items()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import time
@@ -19,10 +20,12 @@ from dehyst.service.runtime.stopping import StopSignal
 EPILOG = """\
 FILE.py:NAME is a Python class, function or object: voltages of a block in (V), true displacement and reading out (µm).
 It has the attributes dt_s (s), u_min_V and u_max_V (V), or the options above give them. The code in FILE.py is run.
+A stage file is that of `dehyst stage`, or what `dehyst diagnose` wrote.
 Errors are in percent of the commanded range. Exit status 1 if a run ends at a voltage limit, stays above 5 % for longer
 than 0.1 s, or follows a wrong sensor.
 
   dehyst rehearse --plant examples/plant.py:Stage
+  dehyst rehearse --plant out/diagnosis/stage.toml --events none,gain_at_once
   dehyst rehearse --plant mine.py:run --rate 1000 --u-min 0 --u-max 100 --events none,knock,gain_at_once
 """
 
@@ -34,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
     add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
-    add("--plant", required=True, metavar="FILE.py:NAME", help="the simulated stage")
+    add("--plant", required=True, metavar="FILE.py:NAME", help="the simulated stage; or a stage file, FILE.toml")
     add("--rate", type=float, metavar="HZ", help="samples a second, Hz, where the plant has no dt_s")
     add("--u-min", type=float, metavar="V", help="lowest voltage of the drive, V, where the plant has no u_min_V")
     add("--u-max", type=float, metavar="V", help="highest voltage of the drive, V, where the plant has no u_max_V")
@@ -53,6 +56,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         out={"default": Path("out/rehearsal"), "help": "folder for the results (%(default)s)"},
         json={"help": "print rehearsal.json in place of the table"},
     )
+
+
+def _plant(where: str) -> object:
+    """The plant that ``--plant`` names: an object of a Python file, or a stage file. Raises FieldError, InputError."""
+    if Path(where).suffix not in (".toml", ".json"):
+        return load_object("--plant", where, "examples/plant.py:Stage")
+    from dehyst.lab.rehearsal.plant import StagePlant
+    from dehyst.sim.stage.file import load_stage
+
+    return functools.partial(StagePlant, load_stage(where))
 
 
 def _ages(text: str) -> tuple[int, ...]:
@@ -97,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     config = RehearsalConfig(settle_s=args.settle, after_s=args.after)
     names = args.events.split(",") if args.events else STANDARD
     events = standard_events(args.seed, config.settle_s, names)
-    given = load_object("--plant", args.plant, "examples/plant.py:Stage")
+    given = _plant(args.plant)
     factory = factory_of(given, 1.0 / args.rate if args.rate else None, args.u_min, args.u_max)
     clear_output(args.out, OURS)
     begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""``dehyst reproduce``: compute the chapter's tables and figures."""
+"""``dehyst reproduce``: compute the chapter's tables."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 from dehyst.service.cli.options import add_epilog, add_shared, progress_printer
 
 EPILOG = """\
-Writes DIR/report.md (the chapter's numbers beside ours), DIR/tables.json, and one PNG for each figure in a folder for
-each stage. Displacements are in µm, voltages in V, errors in percent of the motion range. Measured data come from the
+Writes DIR/report.md (the chapter's numbers beside ours), DIR/tables.json, and some figures in a folder for each
+stage. Displacements are in µm, voltages in V, errors in percent of the motion range. Measured data come from the
 folder in the environment variable DEHYST_DATA; where they are missing, that part is left out.
 
   dehyst reproduce --out out/reproduce

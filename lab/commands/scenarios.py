@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
-    from dehyst.lab.scenarios import draw_overview, table
+    from dehyst.lab.scenarios import table
     from dehyst.service.config.learner import read_learner_settings
     from dehyst.service.storage.output import clear_output
 
@@ -78,8 +78,6 @@ def run(args: argparse.Namespace) -> int:
     }
     (args.out / "scenarios.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     (args.out / "scenarios.md").write_text(table(verdicts, markdown=True) + "\n", encoding="utf-8")
-    if not args.no_pictures:
-        draw_overview(args.out / "scenarios.png", verdicts)
     if args.json:
         print(json.dumps(summary))
     else:

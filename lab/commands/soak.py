@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         out={"default": Path("out/soak"), "help": "folder for the results (%(default)s)"},
     )
     add("--fast", action="store_true", help=argparse.SUPPRESS)
+    add("--stage", help=argparse.SUPPRESS)
     add("--faults", default="", metavar="A,B", help="only these kinds, or none (all; --list prints them)")
     add("--list", action="store_true", help="list the kinds of faults, and exit")
     add_shared(
         parser,
         "quiet",
-        stage={"type": Path, "default": None, "metavar": "FILE", "help": "a stage file in place of the preset"},
         json={"help": "print soak.json in place of the report"},
     )
 
@@ -57,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.fast:
         raise InputError("--fast: replaced by `dehyst rehearse`, which runs faults of samples in lockstep")
+    if args.stage is not None:
+        raise InputError(f"--stage: removed; try the service on it: dehyst rehearse --plant {args.stage}")
     duration_s = seconds(args.duration)
     check_seed(args.seed)
     say = progress_printer(args.quiet)
@@ -68,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
     done = soak.run(
         args.out,
         make_plan(duration_s, args.seed, kinds),
-        stage_file=args.stage,
         stopped=lambda: bool(stop.reason),
         say=say,
     )

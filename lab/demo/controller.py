@@ -51,11 +51,10 @@ class FollowedModels:
 
     Attributes
     ----------
-    std_V : (ticks,) by model, V. durations_s : of the evaluation of each block.
+    durations_s : of the evaluation of each block.
     """
 
     def __init__(self, plan: Plan, followers: Mapping[str, Follower]) -> None:
-        self.std_V = empty(plan)
         self.durations_s: list[float] = []
         self._plan, self._followers = plan, followers
         self._wanted = plan.reference()
@@ -72,11 +71,7 @@ class FollowedModels:
                 stop = min(done + CHUNK, self._plan.ticks)
                 y, v, a = (column[done:stop] for column in self._wanted)
                 follower = self._followers[name]
-                u_V, _ = follower.trajectory(y, v, a)
-                got = follower.last_trajectory
-                assert got is not None
-                self.std_V[name][done:stop] = got.std_V
-                yield name, done, u_V
+                yield name, done, follower.trajectory(y, v, a)[0]
                 self._done[name] = done = stop
 
     def wait(self, fresh: int, timeout_s: float) -> None:
@@ -103,7 +98,6 @@ class FollowedModels:
         answer = follower.answer(FeedforwardQuery(y, v, a, None, TEACHER, as_of, u_before_V, before))
         self.durations_s.append(time.perf_counter() - started)
         self._commanded.take(begin, y, answer)
-        self.std_V[TEACHER][begin:end] = answer.std_V[: end - begin]
         self._used.append((begin, as_of, answer.snapshot_seq))
         self._extrapolated += (fresh - block) * plan.block
         return begin, answer.u_V
@@ -147,7 +141,7 @@ class Twins:
     """The readings of the twin stages so far, filled by zenoh's thread."""
 
     def __init__(self, plan: Plan, session: zenoh.Session) -> None:
-        self.y_um, self.u_V = empty(plan), empty(plan)
+        self.y_um = empty(plan)
         self.seen = {name: 0 for name in MODELS}
         self._ticks = plan.ticks
         self._moved = threading.Condition()
@@ -162,7 +156,6 @@ class Twins:
             if stop > self._ticks:
                 return
             self.y_um[name][first:stop] = batch.y_um
-            self.u_V[name][first:stop] = batch.u_V
             with self._moved:
                 self.seen[name] = stop
                 self._moved.notify_all()
@@ -227,8 +220,7 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
                 lease.undeclare()
             event.undeclare()  # type: ignore[no-untyped-call]
         counts = models.counts()
-    kinds = {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": models.std_V}
-    arrays: dict[str, Any] = {f"{kind}/{name}": values[name] for kind, values in kinds.items() for name in MODELS}
+    arrays: dict[str, Any] = {f"y_um/{name}": values for name, values in twins.y_um.items()}
     np.savez(out, query_s=np.asarray(models.durations_s), followed=json.dumps(counts), **arrays)
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1

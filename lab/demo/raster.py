@@ -14,14 +14,12 @@ from dehyst.lab.loop import samples, stepped
 from dehyst.lab.rehearsal.controllers import Following, line_errors_pct, raster_times, repeating, triangles
 from dehyst.lab.rehearsal.reference import BEGIN_S, Motion, ReferenceRequest
 from dehyst.lab.rehearsal.runs import IDLE_S
-from dehyst.service.config.correction import CorrectionConfig
 from dehyst.service.reports.plot_style import figure, label, legend, line, save
 from dehyst.service.server.axis import Axis
 from dehyst.service.viewer.colours import ADAPTIVE, FROZEN
-from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.stage import Stage
 
-#: Lines a second on the usual stage; a slower one has fewer.
+#: Lines a second.
 LINES_PER_S: Final = 20.0
 #: Lines of the picture.
 SHOWN: Final = (1, 5, 20)
@@ -52,9 +50,10 @@ class RasterRun:
 
 def run_raster(plan: Plan, axes: dict[str, Axis]) -> RasterRun:
     """The raster on new stages, unchanged and at rest, each with one of the new ``axes``, by controller."""
-    dt_s, config, hertz = plan.dt_s, plan.stage(changing=False), LINES_PER_S / plan.slowness
+    dt_s, config, hertz = plan.dt_s, plan.stage(changing=False), LINES_PER_S
     t_s = raster_times(hertz, dt_s)
-    rest_V = np.full(round(IDLE_S / dt_s), plan.drive_low_V)
+    rest_V = np.zeros(round(IDLE_S / dt_s))
+    mode_Hz = config.effects["resonance"].values["frequency_Hz"]
     true_um: dict[str, FloatArray] = {}
     for way, axis in axes.items():
         stage = Stage(config)
@@ -63,7 +62,7 @@ def run_raster(plan: Plan, axes: dict[str, Axis]) -> RasterRun:
         axis.handle(samples(0, dt_s, rest_V, at_rest_um))
         wish = ReferenceRequest(at_rest_um.item(-1), plan.low_um, plan.high_um, t_s.item(-1), plan.seed)
         wanted = triangles(hertz)(wish)(t_s)
-        correcting = repeating(axis, _mode_Hz(config)) if way == REPETITION else None
+        correcting = repeating(axis, mode_Hz) if way == REPETITION else None
         controller = Following(axis, wanted, rest_V.size, correcting, learns=True)
 
         def driven(_: int, u_V: FloatArray, stage: Stage = stage, state: Any = state) -> tuple[float, float]:
@@ -73,12 +72,6 @@ def run_raster(plan: Plan, axes: dict[str, Axis]) -> RasterRun:
         true_um[way] = stepped(controller, t_s.size, _AGE, driven).true_um
     lines_pct = {way: line_errors_pct(wanted.y_um, y_um, hertz, dt_s) for way, y_um in true_um.items()}
     return RasterRun(wanted, true_um, lines_pct, hertz)
-
-
-def _mode_Hz(config: StageConfig) -> float:
-    """The lowest mode that the stage is known to have, Hz; the default of the settings where it tells none."""
-    modes = [e.values["frequency_Hz"] for e in config.effects if e.name == "resonance"]
-    return min(modes, default=CorrectionConfig().mode_Hz)
 
 
 def told(raster: dict[str, Any]) -> str:

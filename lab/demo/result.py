@@ -109,23 +109,19 @@ class DemoRun:
 
     Attributes
     ----------
-    y_um, u_V, std_V : by model, (ticks,); the reading, the voltage applied, its standard deviation.
+    y_um : by model, (ticks,), the readings.
     query_s : durations of the evaluations of a block, s. followed : of the learning model, see `FollowedModels.counts`.
     samples : counts ``sent``, ``received``, ``learnt`` of the stage that the service learns from.
-    ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
-    notes : records for the viewer (events, diagnostics, status), in order.
+    ticks : counts ``count`` and ``late`` (no command in time).
     pace : of a run with a clock, s: ``stage_s`` of the stage's time, ``ran_s`` that it took, and ``waited_s`` for which
     the stage's clock stood still. Empty without a clock.
     """
 
     y_um: dict[str, FloatArray]
-    u_V: dict[str, FloatArray]
-    std_V: dict[str, FloatArray]
     query_s: FloatArray
     samples: dict[str, int]
     ticks: dict[str, int]
     followed: dict[str, float]
-    notes: list[Any] = field(default_factory=list)
     pace: dict[str, float] = field(default_factory=dict)
 
     def summary(self, plan: Plan, reference_um: FloatArray) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from typing import Any, Final, cast
 import numpy as np
 import zenoh
 
-from dehyst.adaptive.errors import InputError
 from dehyst.lab.demo.controller import KEPT, FollowedModels
 from dehyst.lab.demo.plan import (
     AXIS,
@@ -25,31 +24,26 @@ from dehyst.lab.demo.plan import (
     UNITS,
     Plan,
     make_plan,
-    plan_for,
 )
 from dehyst.lab.demo.raster import ALONE, REPETITION, draw_raster, run_raster
 from dehyst.lab.demo.result import DemoRun, draw_loops, draw_tracking
 from dehyst.lab.loop import Twins, samples, turns
-from dehyst.lab.testbed.identified_stage import READY_S, Rig, write_service_config
+from dehyst.lab.testbed.identified_stage import READY_S, Rig, identify_stage, write_service_config
 from dehyst.lab.testbed.processes import Child
 from dehyst.service.client.client import Client
 from dehyst.service.client.follower import Follower
 from dehyst.service.config.settings import read_config
-from dehyst.service.identification.identifying import NAMES, Stretch, identify_all
+from dehyst.service.identification.identifying import NAMES
 from dehyst.service.protocol.errors import ServiceError
 from dehyst.service.protocol.model import encode_model
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.server.deltas import DeltaStreams
-from dehyst.service.storage.model_file import BundleMeta, write_bundle
 from dehyst.service.storage.output import clear_output
 from dehyst.service.storage.recorder import Recorder, RecorderConfig
-from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Tracking
-from dehyst.service.viewer.rerun_sink import write_recording
-from dehyst.sim.recordings import read, repaired
 from dehyst.sim.stage.stage import Stage
 
-# --- In real time or slower: stage, service, controller, viewer stream and a bare paced loop as processes over zenoh.
+# --- In real time or slower: stage, service, controller and viewer stream as processes over zenoh.
 
 
 #: A process may end so much later than planned, s.
@@ -70,22 +64,19 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         viewer = rig.start_viewer(rrd, STAGE, AXIS, plan.range_um, *view, *shown)
         where = ["--endpoint", rig.endpoint, "--twins", ",".join(twins.values())]
         stage = rig.start_stage(STAGE, AXIS, *where, *_stage_options(plan))
-        loop = rig.start_paced_loop(plan.dt_s, plan.ticks, wait=False)
         program = ["-m", "dehyst.lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
         controller = rig.start("controller", program, wait=False)
         _follow(controller, server, progress)
         if stage.wait(_OVERTIME_S) != 0:
             raise ServiceError(f"the stage failed: {stage.output_tail()}")
-        loop.wait(_OVERTIME_S)
         _wait_until_handled(rig.endpoint, plan)
         server.stop()
         viewer.stop(60.0)
-        return _collect(result, server, stage, loop)
+        return _collect(result, server, stage)
 
 
 def _stage_options(plan: Plan) -> list[str]:
     options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(plan.ticks * plan.dt_s)]
-    options += ["--file", plan.stage_file] if plan.stage_file else []
     options += ["--batch", str(plan.block)]
     options += [] if plan.strict else ["--lock-step", repr(LOCK_STEP_S)]
     for t_s, values in plan.stage(changing=True).changes:
@@ -120,9 +111,9 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
             time.sleep(0.05)
 
 
-def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
+def _collect(result: Path, server: Child, stage: Child) -> DemoRun:
     with np.load(result) as kept:
-        y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
+        y_um = {name: kept[f"y_um/{name}"] for name in MODELS}
         query_s, followed = kept["query_s"], json.loads(str(kept["followed"]))
     result.unlink()
     summary = stage.last_json()
@@ -132,12 +123,10 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     ticks = {
         "count": summary["tick"],
         "late": max(unit["commands"]["missing"] for unit in units.values()),
-        "stage_late": summary["late"],
-        "bare_late": loop.last_json()["late"],
     }
     stage_s = summary["tick"] * summary["dt_s"]
     pace = {"stage_s": stage_s, "ran_s": summary["ran_s"], "waited_s": summary["waited_s"]}
-    return DemoRun(y_um, u_V, std_V, query_s, samples, ticks, followed, pace=pace)
+    return DemoRun(y_um, query_s, samples, ticks, followed, pace)
 
 
 # --- In one process, as fast as possible: the same models, queries and answers, without a network.
@@ -145,46 +134,6 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
 
 #: Called with the number of ticks done and, by model, the mean absolute error of the last second, µm.
 Progress = Callable[[int, dict[str, float]], None]
-
-
-class _Samples:
-    """The twin stages of a fast run: drives them block by block, and hands the teacher's samples to ``axis``."""
-
-    def __init__(self, plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> None:
-        self._twins = Twins(Stage(plan.stage(changing=True)), tuple(MODELS), plan.ticks)
-        self.u_V, self.y_um = self._twins.u_V, self._twins.y_um
-        self.notes: list[Diagnostics] = []
-        self._plan, self._axis, self._recorder, self._progress = plan, axis, recorder, progress
-        self._wanted_um = plan.reference()[0]
-
-    def drive(self, block: int) -> None:
-        """Run the block with this number with its voltages in ``u_V``."""
-        plan, axis, size = self._plan, self._axis, self._plan.block
-        done = block * size
-        part = slice(done, done + size)
-        self._twins.run(part)
-        batch = samples(done, plan.dt_s, self.u_V[TEACHER][part], self.y_um[TEACHER][part])
-        verdicts = axis.handle(batch)
-        self._recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
-        if done % 100 == 0 and axis.learner is not None:
-            told = axis.learner.diagnostics()
-            if done % 1000:
-                told = {
-                    key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
-                }
-            self.notes.append(Diagnostics(float(batch.t_s[-1]), int(batch.seq[-1]), told))
-        if (done + size) % 1000 == 0:
-            tail = slice(max(0, done + size - 1000), done + size)
-            errors = {k: float(np.mean(np.abs(self._wanted_um[tail] - self.y_um[k][tail]))) for k in MODELS}
-            self._progress(done + size, errors)
-
-    def result(self, models: FollowedModels) -> DemoRun:
-        """The run."""
-        n, axis = self._plan.ticks, self._axis
-        samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
-        ticks = {"count": n, "late": 0, "bare_late": 0}
-        durations = np.asarray(models.durations_s)
-        return DemoRun(self.y_um, self.u_V, models.std_V, durations, samples, ticks, models.counts(), self.notes)
 
 
 class _Loopback:
@@ -209,8 +158,8 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
 
     The teacher's samples go into ``axis``.
     """
-    driven = _Samples(plan, axis, recorder, progress)
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
+    twins, wanted_um = Twins(Stage(plan.stage(changing=True)), tuple(MODELS), n), plan.reference()[0]
     loopback, streams = _Loopback(), DeltaStreams(axis)
     streams.publish(TEACHER, loopback.put, lambda: True)
     streams.tick(0.0)
@@ -224,14 +173,23 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
     models = FollowedModels(plan, followers)
     for run, asked in turns(n // size, ahead):
         if run is not None:
-            driven.drive(run)
-            streams.tick((run + 1) * size * plan.dt_s)
+            part = slice(run * size, (run + 1) * size)
+            twins.run(part)
+            batch = samples(part.start, plan.dt_s, twins.u_V[TEACHER][part], twins.y_um[TEACHER][part])
+            recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, axis.handle(batch))
+            streams.tick(part.stop * plan.dt_s)
+            if part.stop % 1000 == 0:
+                last = slice(part.stop - 1000, part.stop)
+                errors = {k: float(np.mean(np.abs(wanted_um[last] - y_um[last]))) for k, y_um in twins.y_um.items()}
+                progress(part.stop, errors)
         if asked is not None:
             for name, begin, u_V in models.constant(asked * size):
-                driven.u_V[name][begin : begin + u_V.size] = u_V
+                twins.u_V[name][begin : begin + u_V.size] = u_V
             begin, u_V = models.block(asked, asked, asked + 1)
-            driven.u_V[TEACHER][begin : begin + u_V.size] = u_V
-    return driven.result(models)
+            twins.u_V[TEACHER][begin : begin + u_V.size] = u_V
+    counts = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
+    ticks = {"count": n, "late": 0}
+    return DemoRun(twins.y_um, np.asarray(models.durations_s), counts, ticks, models.counts())
 
 
 Say = Callable[[str], None]
@@ -266,29 +224,21 @@ def run(
     seed: int,
     view: list[str],
     say: Say,
-    stage: Path | None = None,
     strict: bool = False,
 ) -> Done:
-    """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
-
-    ``strict`` : the stage's clock waits for no voltage.
+    """Run everything and write the results into ``out``. ``strict`` : the stage's clock waits for no voltage.
 
     Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
-    own = stage.resolve() if stage is not None else None
     clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
-    how = (duration_s, seed, strict)
-    plan = make_plan(*how) if own is None else plan_for(own, logs, *how)
-    say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
-    _record(plan, out / "identification")
-    say("[2/4] identifying five inverse models from 10 s at 1 kHz")
-    model = out / "model.npz"
-    _identify(plan, out / "identification", model, say)
+    plan = make_plan(duration_s, seed, strict)
+    say("[1/3] identifying five inverse models from 10 s of the chapter's training signal on a rested stage")
+    _identify(plan, out / "identification", out / "model.npz", say)
     live = "in real time" if strict else f"in real time, waiting up to {LOCK_STEP_S:g} s for each other"
     kind = "as fast as possible, in one process" if fast else f"in processes over zenoh, {live}"
-    say(f"[3/4] {plan.run_s:g} s of a reference that no model has seen, {kind}")
+    say(f"[2/3] {plan.run_s:g} s of a reference that no model has seen, {kind}")
     say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
     rig = Rig(logs)
     config = _configure(plan, out, logs / "serve.toml", rig.endpoint)
@@ -307,10 +257,9 @@ def run(
         axis = load_axis(STAGE, read_config(config).axes[0])
         with Recorder(RecorderConfig(out / "recording")) as recorder:
             done = run_fast(plan, axis, recorder, progress)
-        write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
     else:
         done = run_live(plan, config, rig, out / "demo.rrd", view, progress)
-    say("[4/4] a raster on a rested stage, and the pictures")
+    say("[3/3] a raster on a rested stage, and the pictures")
     raster = run_raster(plan, {way: load_axis(STAGE, read_config(config).axes[0]) for way in (ALONE, REPETITION)})
     wanted_um = plan.reference()[0]
     summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time", "raster": raster.summary()}
@@ -321,40 +270,13 @@ def run(
     return Done(plan, done, summary)
 
 
-def _record(plan: Plan, folder: Path) -> None:
-    u_V, stage = plan.identification_voltage(), Stage(plan.stage(changing=False))
-    y_um, _ = stage.run(stage.initial_state(), u_V)
-    seq = np.arange(u_V.size)
+def _identify(plan: Plan, folder: Path, model: Path, say: Say) -> None:
+    """Identify the models on a rested stage; the recording that they come from goes into ``folder``."""
+    stage = plan.stage(changing=False)
+    found = identify_stage(stage, model, STAGE, AXIS, NAMES, TEACHER, lambda name: say(f"  {MODELS[name]} ..."))
+    seq = np.arange(found.u_V.size)
     with Recorder(RecorderConfig(folder)) as recorder:
-        recorder.put(seq, seq * plan.dt_s, u_V, y_um, "identification")
-
-
-def _identify(plan: Plan, data: Path, model: Path, say: Say) -> None:
-    recording = read(data)
-    whole = Stretch.of(repaired(recording))
-
-    def progress(name: str, phase: str, _share: float) -> None:
-        if phase == "fit":
-            say(f"  {MODELS[name]} ...")
-
-    results = identify_all(whole, whole, recording.dt_s, follows=False, progress=progress)
-    failed = [f"{result.name}: {result.failed}" for result in results if result.model is None]
-    if failed:
-        raise InputError(f"identification: {'; '.join(failed)}")
-    models = {result.name: result.model for result in results if result.model is not None}
-    assert set(models) == set(NAMES)
-    meta = BundleMeta(
-        stage=STAGE,
-        axis=AXIS,
-        dt_s=recording.dt_s,
-        source=data.name,
-        source_sha256=recording.sha256,
-        y_min_um=float(whole.motion[:, 0].min()),
-        y_max_um=float(whole.motion[:, 0].max()),
-        u_min_V=float(whole.u_V.min()),
-        u_max_V=float(whole.u_V.max()),
-    )
-    write_bundle(model, models, meta)
+        recorder.put(seq, seq * plan.dt_s, found.u_V, found.y_um, "identification")
 
 
 def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
@@ -375,20 +297,3 @@ def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
     }
     write_service_config(path, STAGE, axis, listen=[endpoint])
     return path
-
-
-def _scene(plan: Plan) -> SceneConfig:
-    models = (TEACHER, *(name for name in MODELS if name != TEACHER))
-    return SceneConfig(f"{STAGE}/{AXIS}", models, range_um=plan.range_um)
-
-
-def _records(plan: Plan, done: DemoRun) -> list[Record]:
-    seq = np.arange(plan.ticks)
-    t_s = seq.astype(np.float64) * plan.dt_s
-    wanted_um = plan.reference()[0]
-    records: list[Record] = [
-        Tracking(name, seq, t_s, done.u_V[name], done.y_um[name], wanted_um, done.std_V[name]) for name in MODELS
-    ]
-    at = plan.change_tick
-    records.append(Event(at * plan.dt_s, at, f"the stage changes: {plan.change_text}", "WARN", change=True))
-    return records + list(done.notes)

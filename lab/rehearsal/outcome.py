@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from dehyst.adaptive.online.gates import GLITCH, UNTRUSTED
 from dehyst.adaptive.types import BoolArray, FloatArray
 from dehyst.lab.rehearsal.disturbance import SENSOR, Event
 from dehyst.lab.rehearsal.runs import LoopRecord
@@ -30,10 +29,6 @@ END_S: Final = 0.1
 BREAK_S: Final = 0.01
 #: A reference that moves by less than this share of the range per second is at rest.
 REST_PER_S: Final = 0.02
-#: Verdicts on samples of which it is open what they mean; those that ring about a new level are held back too, but the
-#: change is believed. A change that is not held back within this time, s, is followed without a decision.
-UNDECIDED: Final = frozenset({GLITCH, UNTRUSTED})
-NOTICED_S: Final = 0.05
 #: Error allowed during a sensor fault: percent of the range, or this multiple of the error of the better of two models
 #: that do not learn: the identified one, and the last estimate before the fault.
 SENSOR_PCT, SENSOR_FACTOR = 1.0, 1.5
@@ -49,12 +44,11 @@ class ErrorFigures:
     first_second_pct, then_pct : of the first second from the event on, and of 1 to 4 s after it.
     during_pct : during the event, NaN if it does not last.
     settled_pct : of the last 2 s of the run.
-    worst_half_second_pct, worst_pct : largest mean over half a second, and largest error, from the event on.
+    worst_half_second_pct : largest mean over half a second, from the event on.
     large_s : longest time with an error above 5 % in the whole run. It does not count where the voltage is at the limit
         that moves the stage towards the reference. Interruptions up to 10 ms do not end it.
     large_at_s : when that began, s after the event (negative: before it); NaN if never.
-    rail_s : longest time at a limit of the drive that the reference did not require.
-    ends_at_rail : whether the run ended there.
+    ends_at_rail : whether the run ended at a limit of the drive that the reference did not require.
     """
 
     before_pct: float
@@ -63,10 +57,8 @@ class ErrorFigures:
     during_pct: float
     settled_pct: float
     worst_half_second_pct: float
-    worst_pct: float
     large_s: float
     large_at_s: float
-    rail_s: float
     ends_at_rail: bool
 
 
@@ -104,10 +96,7 @@ class Outcome:
     happened.
     healthy_s : how long nothing had happened, s.
     named_s : motion, s, from the event to its first report; NaN if it was not reported, or is no sensor fault.
-    believed_samples : from the event to the first sample of which it is known what it means, after others of which it
-    was not; NaN if there were none, or they went on to the end.
     jumps : jumps that the learner has believed from the event on.
-    noted : names of the axis' events from the event on, with their counts.
     simulated_s : length of the run, s.
     """
 
@@ -124,9 +113,7 @@ class Outcome:
     false_troubles: tuple[str, ...]
     healthy_s: float
     named_s: float
-    believed_samples: float
     jumps: int
-    noted: dict[str, int]
     simulated_s: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -155,10 +142,8 @@ def figures(course: LoopRecord, event: Event, range_um: float, limits: Limits, d
         during_pct=_mean(error_pct[at:end]),
         settled_pct=_mean(error_pct[max(end, n - quiet) :]),
         worst_half_second_pct=float(moving_mean(error_pct[at:], window).max()),
-        worst_pct=float(error_pct[at:].max()),
         large_s=large * dt_s,
         large_at_s=(from_tick - at) * dt_s if large else float("nan"),
-        rail_s=longest_stretch(rail)[0] * dt_s,
         ends_at_rail=bool(last.all()),
     )
 
@@ -194,30 +179,9 @@ def outcome(
         false_troubles=tuple(t.name for t in troubles if t.named_s + event.at_s < healthy_s),
         healthy_s=healthy_s,
         named_s=true[0].motion_s if true else float("nan"),
-        believed_samples=_believed_samples(adaptive, event, dt_s),
         jumps=int(adaptive.jumps[-1] - adaptive.jumps[max(0, round(event.at_s / dt_s) - 1)]),
-        noted=_noted(adaptive, event.at_s),
         simulated_s=adaptive.t_s.size * dt_s,
     )
-
-
-def _believed_samples(course: LoopRecord, event: Event, dt_s: float) -> float:
-    at, soon = round(event.at_s / dt_s), round(NOTICED_S / dt_s)
-    held = np.isin(course.verdict[at:], [i for i, name in enumerate(course.verdicts) if name in UNDECIDED])
-    if not held[: soon + 1].any():
-        return float("nan")
-    first = int(np.argmax(held))
-    free = ~held[first:]
-    return float(first + np.argmax(free)) if free.any() else float("nan")
-
-
-def _noted(course: LoopRecord, from_s: float) -> dict[str, int]:
-    """Names of the axis' events from ``from_s`` on, with their counts."""
-    counts: dict[str, int] = {}
-    for t_s, name, _ in course.events:
-        if t_s >= from_s:
-            counts[name] = counts.get(name, 0) + 1
-    return counts
 
 
 def moving_mean(values: FloatArray, window: int) -> FloatArray:

@@ -7,7 +7,7 @@ import inspect
 import math
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -21,6 +21,8 @@ from dehyst.service.config.settings import LEARN
 from dehyst.service.identification.identifying import identify_one
 from dehyst.service.protocol.errors import FieldError
 from dehyst.sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
+from dehyst.sim.stage.config import StageConfig
+from dehyst.sim.stage.stage import Stage
 
 # --- What a rehearsal accepts as a stage: an object or a function that turns a block of voltages into displacements.
 #
@@ -94,6 +96,19 @@ class FunctionPlant:
 
     def run(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self._function(u_V)
+
+
+class StagePlant:
+    """A simulated stage, as in a stage file, without the changes that it plans; its first axis is the plant."""
+
+    def __init__(self, config: StageConfig) -> None:
+        self.dt_s, self.u_min_V, self.u_max_V = config.dt_s, config.u_min_V, config.u_max_V
+        self._stage = Stage(replace(config, changes=()))
+        self._state = self._stage.initial_state()
+
+    def run(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
+        run = self._stage.run_traced(self._state, u_V)
+        return run.true_um, run.y_um
 
 
 def check_numbers(plant: Plant) -> None:

@@ -41,7 +41,7 @@ class LoopRecord:
     sent or not. u_V : voltage applied from that instant on. flags : bits of the answer, see
     ``service.protocol.query``. verdict : index into ``verdicts`` of the learner's verdict on the sample. trouble :
     index into ``troubles`` of what the axis reported at that time ("" for nothing).
-    jumps : jumps that the learner has believed up to then. events : (time s, name, detail) of the axis' events.
+    jumps : jumps that the learner has believed up to then.
     """
 
     t_s: FloatArray
@@ -55,7 +55,6 @@ class LoopRecord:
     trouble: NDArray[np.int16]
     troubles: tuple[str, ...]
     jumps: NDArray[np.int64]
-    events: tuple[tuple[float, str, str], ...]
 
 
 def run_adaptive(
@@ -78,7 +77,6 @@ def run_adaptive(
     verdict, trouble = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int16)
     jumps = np.zeros(n, dtype=np.int64)
     verdicts, troubles = {NEVER_CAME: 0}, {"": 0}  # small integers for names
-    events: list[tuple[float, str, str]] = []
     ask, offset = Asker(axis, u_before_V=u_before_V), first_number  # of the stage's numbers from those of the samples
     newest = -1  # the last sample of the rest
     for run, asked in turns(n // block, 1):
@@ -97,8 +95,6 @@ def run_adaptive(
             trouble[part] = trouble[part.start - 1] if part.start else 0
             trouble[part.stop - 1] = troubles.setdefault(axis.newest.trouble, len(troubles))
             jumps[part] = axis.learner.counters().get("jumps", 0) if axis.learner is not None else 0
-            said_s = (part.stop - 1) * dt_s
-            events += [(said_s, str(event["event"]), str(event["detail"])) for event in axis.take_events()]
             progress(part.stop)
         if asked is not None:
             part = slice(asked * block, (asked + 1) * block)
@@ -108,7 +104,7 @@ def run_adaptive(
             u_V[part], flags[part] = reply.u_V, reply.flags
     return LoopRecord(
         times(n, dt_s), wanted.y_um, true_um, read_um, u_V, flags, verdict, tuple(verdicts), trouble,
-        tuple(troubles), jumps, tuple(events),
+        tuple(troubles), jumps,
     )  # fmt: skip
 
 
@@ -133,7 +129,7 @@ def run_frozen(
     none = np.zeros(n, dtype=np.int16)
     return LoopRecord(
         times(n, model.dt_s), wanted.y_um, true_um, read_um, u_V, flags, none, ("not_learning",), none, ("",),
-        np.zeros(n, dtype=np.int64), (),
+        np.zeros(n, dtype=np.int64),
     )  # fmt: skip
 
 

@@ -17,10 +17,11 @@ from dehyst.adaptive.online.gates import AdmissionConfig
 from dehyst.adaptive.online.learner import Learner
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
-from dehyst.sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
+from dehyst.sim.chapter.control import Control, learner_of, replay, run_control
 from dehyst.sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
 from dehyst.sim.chapter.modelling import ForwardRun, identify_forward
 from dehyst.sim.recordings import ColumnMap, read, repaired
+from dehyst.sim.stage.closed_loop import BlockConfig
 
 # --- The models on data from others: a measured stack actuator.
 #
@@ -152,7 +153,6 @@ class PresetStudy:
     characterisation: Characterisation
     forward: tuple[ForwardRun, ...]
     control: Control
-    replayed: tuple[ReplayRun, ...]
     seconds: float
 
     def model(self, key: str) -> ForwardRun:
@@ -189,9 +189,8 @@ def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study
         character = characterise(data.config)
         forward = identify_forward(data, pso=config.pso, epochs=config.epochs, clock=_CLOCK, progress=say)
         control = run_control(data, quick=config.quick, clock=_CLOCK, progress=say)
-        replayed = replay_records(data, control.inverses, quick=config.quick, progress=say)
         taken = time.perf_counter() - start
-        studies.append(PresetStudy(name, data, character, tuple(forward), control, replayed, taken))
+        studies.append(PresetStudy(name, data, character, tuple(forward), control, taken))
     folder = config.data or data_folder()
     stack = run_stack(folder / "picma_stack", progress) if config.measured else None
     if stack is None and config.measured:

@@ -66,6 +66,15 @@ class ControlTask:
         """Commanded range, µm, to which all percentages refer."""
         return self.high_um - self.low_um
 
+    def allows(self, u_V: FloatArray, before_V: float) -> bool:
+        """Whether an answer, (n,) V, keeps the service's promise: finite, within limits, within slew from the voltage
+        ``before_V``, NaN for none."""
+        if not np.isfinite(u_V).all():
+            return False
+        steps = np.abs(np.diff(u_V, prepend=before_V if math.isfinite(before_V) else u_V[0]))
+        within = self.u_min_V <= u_V.min() and u_V.max() <= self.u_max_V
+        return bool(within and steps.max() <= self.slew_V_per_s * self.dt_s * (1.0 + 1e-9))
+
     def write(self, path: Path) -> None:
         """Write the task for the processes of controller and prober."""
         path.write_text(json.dumps(asdict(self)), encoding="utf-8")
@@ -222,21 +231,13 @@ class Controller:
                 continue
             if not clock.before(begin):
                 break
-            self.counts["unsafe"] += not self._safe(answer)
+            self.counts["unsafe"] += not self.control.allows(answer.u_V, self._last_V)
             self._last_V = float(answer.u_V[-1])
             with contextlib.suppress(zenoh.ZError):
                 self._commands.put(wire.encode_command(begin, answer.u_V))
             return answer
         self.counts["given_up"] += 1
         return None
-
-    def _safe(self, answer: Trajectory) -> bool:
-        """Whether an answer keeps the promise of the service: finite, within limits, within slew from the last
-        voltage."""
-        c, u_V = self.control, answer.u_V
-        steps = np.abs(np.diff(u_V, prepend=self._last_V if math.isfinite(self._last_V) else u_V[0]))
-        within = bool(np.isfinite(u_V).all()) and c.u_min_V <= u_V.min() and u_V.max() <= c.u_max_V
-        return within and float(steps.max()) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
 
 
 def run(task: ControlTask, endpoint: str) -> int:

@@ -25,7 +25,6 @@ from dehyst.lab.soak.observed import (
     FaultRecord,
     Intervals,
     Observations,
-    SampleSecond,
     SampleTracker,
     between,
     told_by,
@@ -144,7 +143,7 @@ _BLOCK_BYTES: Final = 100.0
 UNDER_WAY = 64
 
 
-def judge(observed: Observations, missing: int, tracking_pct: float = TRACKING_PCT) -> dict[str, Invariant]:
+def judge(observed: Observations, missing: int) -> dict[str, Invariant]:
     """Judge all invariants, after `assess`. ``missing``: samples that were seen and are in no recording."""
     seconds, faults, probes = observed.seconds, observed.faults, observed.probes
     found = {
@@ -180,7 +179,7 @@ def judge(observed: Observations, missing: int, tracking_pct: float = TRACKING_P
     found["samples_accounted"] = _samples_accounted(observed.counters)
     found["processes_alive"] = _at_most(len(observed.ended), 0, "processes", "processes that ended by themselves")
     found["no_record_lost"] = _at_most(missing, 0, "samples", "samples that came and are in nobody's recording")
-    found["tracking"] = _tracking(observed, tracking_pct)
+    found["tracking"] = _tracking(observed)
     found["memory"] = _memory(observed)
     return found
 
@@ -220,19 +219,15 @@ def _recovers(observed: Observations) -> Invariant:
     return _at_most(max([0.0, *over]), RECOVERED_S, "s", "longest beyond its time until all was well")
 
 
-def _tracking(observed: Observations, limit_pct: float) -> Invariant:
+def _tracking(observed: Observations) -> Invariant:
     """The mean |error| of the seconds that show how good the model is: no fault, and every voltage came in time."""
     calm = observed.calm()
     held = {math.floor(s.t_s) + i for s in observed.seconds if s.held for i in (0, 1)}
     good = [s for s in observed.seconds if s.judged and calm(s.t_s) and math.floor(s.t_s) not in held]
-    error_pct = mean_error_pct(good, observed.range_um) if good else None
+    judged = sum(s.judged for s in good) * observed.range_um
+    error_pct = 100.0 * sum(s.error_sum_um for s in good) / judged if good else None
     text = f"mean absolute error outside fault windows, over {len(good)} s in which every voltage came in time"
-    return _at_most(error_pct, limit_pct, "% of range", text, "no such second")
-
-
-def mean_error_pct(seconds: Sequence[SampleSecond], range_um: float) -> float:
-    """Mean |error| of these seconds, percent of the range."""
-    return 100.0 * sum(s.error_sum_um for s in seconds) / sum(s.judged for s in seconds) / range_um
+    return _at_most(error_pct, TRACKING_PCT, "% of range", text, "no such second")
 
 
 def _memory(observed: Observations) -> Invariant:

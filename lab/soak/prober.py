@@ -14,6 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.soak.controller import AXIS, STAGE, ControlTask
 from dehyst.lab.testbed.processes import run_client_process
@@ -53,13 +55,9 @@ class Prober:
         now = time.monotonic()
         counts["silent_s"] = max(counts["silent_s"], now - self._answered_s)
         self._answered_s = now
-        counts["unsafe"] += not self._safe(point)
+        before_V = math.nan if self._last is None else self._last.u_V
+        counts["unsafe"] += not self._control.allows(np.array([point.u_V]), before_V)
         self._last = point
-
-    def _safe(self, point: Point) -> bool:
-        c, before = self._control, self._last
-        safe = math.isfinite(point.u_V) and c.u_min_V <= point.u_V <= c.u_max_V
-        return safe and (before is None or abs(point.u_V - before.u_V) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9))
 
     def report(self) -> str:
         """The JSON line of the second; begins a new second."""

@@ -130,9 +130,9 @@ _MAX_LABELS = 60
 
 
 def draw(path: Path, observed: Observations) -> None:
-    """Error and voltage step of every second, times without an answer, and memory in use, every fault marked."""
-    drawn, axes = figure(4, 1, (13.0, 11.0), sharex=True, height_ratios=(2.0, 1.0, 1.2, 1.0))
-    error, step, times, memory = panels = axes[:, 0]
+    """Error of every second, times without an answer, and memory in use, every fault marked."""
+    drawn, axes = figure(3, 1, (13.0, 9.0), sharex=True, height_ratios=(2.0, 1.2, 1.0))
+    error, times, memory = panels = axes[:, 0]
     seconds, percent = observed.seconds, 100.0 / observed.range_um
     t_s = [s.t_s for s in seconds]
     at_most = [max(s.error_max_um * percent, 1e-4) if s.judged else math.nan for s in seconds]
@@ -140,9 +140,6 @@ def draw(path: Path, observed: Observations) -> None:
     error.semilogy(t_s, [s.mae_um * percent for s in seconds], color=ADAPTIVE, lw=1.3, label="mean of the second")
     error.axhline(TRACKING_PCT, color="black", lw=0.8, ls="--")
     error.set_ylabel("|wanted - read|,\n% of range")
-    step.plot(t_s, [s.step_V / observed.step_limit_V for s in seconds], color=SERIES[1], lw=1.0)
-    step.axhline(1.0, color="black", lw=0.8, ls="--")
-    step.set_ylabel("largest voltage step,\nshare of the slew limit")
     asked = [p for p in observed.probes if len(p.trips_us)]
     medians = [1e-6 * float(np.median(p.trips_us)) for p in asked]
     times.semilogy([p.t_s for p in asked], medians, color=ADAPTIVE, lw=1.2, label="median of a query")

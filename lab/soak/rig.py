@@ -13,8 +13,7 @@ from dehyst.lab.testbed.identified_stage import Rig, identify_stage, write_servi
 from dehyst.lab.testbed.processes import Child
 from dehyst.lab.testbed.shifted_clock import write_offset
 from dehyst.sim.stage.config import StageConfig
-from dehyst.sim.stage.file import load_stage, save_stage
-from dehyst.sim.stage.presets import preset
+from dehyst.sim.stage.file import save_stage
 
 #: Models of the service: the baseline that fits any stage, the fallback, and the model that is served.
 MODELS: Final = ("linear", "mpi", SERVED)
@@ -28,12 +27,6 @@ _STARTS, _NUMBERS_PER_START = 1000, 1_000_000_000
 SERVICES: Final = ("a", "b")
 #: Between the last sample and the end of the services, so that they handle what is under way, s.
 _DRAIN_S: Final = 1.0
-
-
-def stage_config(file: Path | None, seed: int) -> StageConfig:
-    """The stage of a file, or by default the one that stands in for hardware. Raises InputError."""
-    config = preset("rich") if file is None else load_stage(file)
-    return replace(config, seed=seed, changes=())
 
 
 def identify(config: StageConfig, path: Path, seed: int) -> ControlTask:

@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from dehyst.lab.soak.fault_plan import SoakPlan
-from dehyst.lab.soak.judge import TRACKING_PCT, assess, judge, mean_error_pct, recorded, unrecordable
+from dehyst.lab.soak.judge import assess, judge, recorded, unrecordable
 from dehyst.lab.soak.live import Say, run_live
 from dehyst.lab.soak.observed import Monitor, Observations
 from dehyst.lab.soak.report import draw, report, soak_summary, write_summary
-from dehyst.lab.soak.rig import SERVICES, identify, stage_config
+from dehyst.lab.soak.rig import SERVICES, identify
 from dehyst.service.storage.output import clear_output
+from dehyst.sim.stage.presets import preset
 
 #: Files and folders of a run. Those of an older run are removed first; other files stay.
 OURS: Final = ("soak.json", "report.md", "plan.json", "soak.png", "soak.rrd", "model.npz", "a", "b", "logs")
-#: Limit of the error for a stage from a file, as a multiple of the error before the first fault.
-OWN_STAGE_RATIO: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +29,15 @@ class Done:
     interrupted: bool
 
 
-def run(out: Path, plan: SoakPlan, *, stage_file: Path | None, stopped: Callable[[], bool], say: Say) -> Done:
-    """Run the plan and write the results into ``out``. ``stage_file``: a stage in place of the default one.
+def run(out: Path, plan: SoakPlan, *, stopped: Callable[[], bool], say: Say) -> Done:
+    """Run the plan and write the results into ``out``.
 
-    Raises InputError on a folder or a stage that cannot be used, ServiceError if a process does not start.
+    Raises InputError on a folder that cannot be used, ServiceError if a process does not start.
     """
     clear_output(out, OURS)
     (out / "logs").mkdir()
-    stage = stage_config(stage_file, plan.seed)
-    say(f"[1/3] identifying stage {stage.name!r} from 10 s of the chapter's signal")
+    stage = preset("rich", seed=plan.seed)
+    say("[1/3] identifying the stage from 10 s of the chapter's signal")
     control = identify(stage, out / "model.npz", plan.seed)
     say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, in real time, in processes over zenoh")
     if plan.left_out:
@@ -48,8 +47,7 @@ def run(out: Path, plan: SoakPlan, *, stage_file: Path | None, stopped: Callable
     missing, samples = _kept(out, observed, run_live(out, stage, control, plan, observed, stopped, say))
     say("[3/3] judging and drawing")
     assess(observed)
-    limit_pct = TRACKING_PCT if stage_file is None else _own_limit_pct(observed)
-    found = soak_summary(observed, judge(observed, missing, limit_pct), samples)
+    found = soak_summary(observed, judge(observed, missing), samples)
     interrupted = observed.duration_s < plan.duration_s - 1.0
     write_summary(out / "soak.json", found)
     draw(out / "soak.png", observed)
@@ -58,14 +56,6 @@ def run(out: Path, plan: SoakPlan, *, stage_file: Path | None, stopped: Callable
     kept = {"seed": plan.seed, "duration_s": plan.duration_s, "left_out": plan.left_out, "faults": happened}
     (out / "plan.json").write_text(json.dumps({**kept, "events": observed.events}, indent=1) + "\n", encoding="utf-8")
     return Done(found, interrupted)
-
-
-def _own_limit_pct(observed: Observations) -> float:
-    first = observed.faults[0].begin_s if observed.faults else observed.duration_s
-    calm = [s for s in observed.seconds if s.judged and 2.0 <= s.t_s < first]
-    # A second in which the stage held a voltage says something about the machine, not about the model.
-    calm = [s for s in calm if not s.held] or calm
-    return OWN_STAGE_RATIO * mean_error_pct(calm, observed.range_um) if calm else TRACKING_PCT
 
 
 def _kept(out: Path, observed: Observations, monitor: Monitor) -> tuple[int, dict[str, int]]:

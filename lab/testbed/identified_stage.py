@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.types import InverseModel
+from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.lab.testbed.processes import Child, Children, free_port
 from dehyst.service.identification.identifying import identify_one
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
@@ -24,33 +24,48 @@ WINDOW: Final = 500
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedStage:
-    """Models by name, and the displacements, µm, that the identification signal reached."""
+    """Models by name, and the (n,) voltages, V, and readings, µm, that they were identified from."""
 
     models: dict[str, InverseModel]
-    low_um: float
-    high_um: float
+    u_V: FloatArray
+    y_um: FloatArray
+
+    @property
+    def low_um(self) -> float:
+        """Lowest reading, µm."""
+        return float(self.y_um.min())
+
+    @property
+    def high_um(self) -> float:
+        """Highest reading, µm."""
+        return float(self.y_um.max())
 
 
 def identify_stage(
-    config: StageConfig, file: Path, stage: str, axis: str, names: Sequence[str], required: str
-) -> IdentifiedStage:
+    config: StageConfig, file: Path, stage: str, axis: str, names: Sequence[str], required: str,
+    progress: Callable[[str], None] = lambda _: None,
+) -> IdentifiedStage:  # fmt: skip
     """Drive the stage with the chapter's training signal (2.37) and write the models ``names`` to ``file``.
 
-    Other models than ``required`` are left out if they do not fit the stage. Raises InputError if ``required`` does
-    not fit.
+    Other models than ``required`` are left out if they do not fit the stage. ``progress`` : called with each name.
+    Raises InputError if ``required`` does not fit.
     """
     u_V = training_input(config.dt_s, IDENTIFY_S)[1].clip(config.u_min_V, config.u_max_V)
     simulated = Stage(config)
     y_um, _ = simulated.run(simulated.initial_state(), u_V)
     models: dict[str, InverseModel] = {}
     for name in names:
+        progress(name)
         try:
             models[name] = identify_one(name, u_V, y_um, config.dt_s, WINDOW)
         except (InputError, NumericsError) as error:
             if name == required:
                 raise InputError(f"stage {config.name!r}: cannot be identified: {error}") from error
-    found = IdentifiedStage(models, float(y_um.min()), float(y_um.max()))
-    meta = BundleMeta(stage, axis, config.dt_s, config.name, y_min_um=found.low_um, y_max_um=found.high_um)
+    found = IdentifiedStage(models, u_V, y_um)
+    meta = BundleMeta(
+        stage, axis, config.dt_s, config.name, y_min_um=found.low_um, y_max_um=found.high_um,
+        u_min_V=float(u_V.min()), u_max_V=float(u_V.max()),
+    )  # fmt: skip
     write_bundle(file, models, meta)
     return found
 
@@ -145,10 +160,4 @@ class Rig(Children):
     def start_echo(self, endpoint: str = "", *, wait: bool = True) -> Child:
         """A bare echo: it listens at ``endpoint``, or connects to the rig's own endpoint."""
         how = ["listen", endpoint] if endpoint else ["connect", self.endpoint]
-        return self.start("echo", ["-m", "dehyst.lab.testbed.processes", "echo", *how], wait=wait)
-
-    def start_paced_loop(self, step_s: float, ticks: int, *, wait: bool = True) -> Child:
-        """A bare paced loop, see `lab.testbed.processes`."""
-        return self.start(
-            "bare", ["-m", "dehyst.lab.testbed.processes", "paced_loop", str(step_s), str(ticks)], wait=wait
-        )
+        return self.start("echo", ["-m", "dehyst.lab.testbed.processes", *how], wait=wait)

@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -178,11 +177,8 @@ class Children:
                 child.stop()
 
 
-# --- Processes that measure the machine beside an experiment: a bare zenoh echo and a bare paced loop.
-#
-# ``python -m dehyst.lab.testbed.processes echo listen|connect ENDPOINT`` answers queries with as many bytes as asked
-# for: the round trip without a service. ``... paced_loop STEP_S TICKS`` only sleeps from tick to tick: how late this
-# machine runs a process that asks for nothing else. Both print ``ready``; the echo runs until stopped.
+# --- A bare zenoh echo: ``python -m dehyst.lab.testbed.processes listen|connect ENDPOINT`` answers queries with as many
+# bytes as asked for, which is the round trip without a service. It prints ``ready`` and runs until stopped.
 
 #: Key of the echo; ``echo/BYTES`` asks for a reply of so many bytes.
 ECHO_KEY = "echo"
@@ -213,26 +209,5 @@ def echo(how: str, endpoint: str) -> int:
     return 0
 
 
-def paced_loop(step_s: float, ticks: int) -> int:
-    """Sleep from tick to tick, and print at the end how many came late by more than a period.
-
-    Ticks that were missed come one after the other without a pause, as the stage's ticks do.
-    """
-    stop = StopSignal()
-    print("ready", flush=True)
-    start, late = time.monotonic(), 0
-    for tick in range(1, ticks + 1):
-        # From the number of the tick, not summed: no drift.
-        due = start + tick * step_s
-        time.sleep(max(0.0, due - time.monotonic()))
-        late += time.monotonic() - due > step_s
-        if stop.reason:
-            break
-    print(json.dumps({"late": late}), flush=True)
-    return 0
-
-
 if __name__ == "__main__":
-    if sys.argv[1] == "echo":
-        sys.exit(echo(sys.argv[2], sys.argv[3]))
-    sys.exit(paced_loop(float(sys.argv[2]), int(sys.argv[3])))
+    sys.exit(echo(sys.argv[1], sys.argv[2]))

@@ -86,7 +86,7 @@ def _file(d: Diagnosis, exported: ExportedStage) -> str:
     kind = f"extended stage in part ({missing})" if exported.left_out else "extended stage"
     return (
         f"`stage.toml` is the {kind if d.causes else 'calibrated stage'}: `dehyst stage --file stage.toml` and "
-        "`dehyst demo --stage stage.toml` run it. "
+        "`dehyst rehearse --plant stage.toml` run it. "
         f"Its free run is {length(exported.rms_um)} rms from the model fitted here (the recorder's latch and hold and "
         "the noise left out)."
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,80 +18,11 @@ from dehyst.baselines import fit_bouc_wen, fit_mpi
 from dehyst.baselines.competition.competition import online_form
 from dehyst.sim.chapter.experiments import DT_S, Experiments, Record, Score
 from dehyst.sim.effects import effect
-from dehyst.sim.signals.references import Reference, blend_step, demo_reference
+from dehyst.sim.signals.references import Reference, Sequenced, Tones, demo_reference, strokes
 from dehyst.sim.signals.voltages import sample_times
-from dehyst.sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
+from dehyst.sim.stage.closed_loop import CHAPTER_GAINS, PID, BlockConfig, Run, UltimateGain, track, ultimate_gain
 from dehyst.sim.stage.config import StageConfig
-from dehyst.sim.stage.stage import Stage, StageState
-
-# --- Control and replay with a model that learns while it serves, in one process and without a clock.
-#
-# Block by block, a snapshot that has seen no sample of the last ``delay_blocks`` blocks gives the voltages of the next
-# one. The stage runs on them, with feedback added sample by sample, and its samples then teach the model. That is what
-# the service does.
-
-
-@dataclass(frozen=True, slots=True)
-class BlockConfig:
-    """block : samples answered at once, >= 1. delay_blocks : age of the answering snapshot, blocks, >= 1.
-
-    Raises InputError on smaller values.
-    """
-
-    block: int = 20
-    delay_blocks: int = 3
-
-    def __post_init__(self) -> None:
-        if self.block < 1 or self.delay_blocks < 1:
-            raise InputError(f"block, delay_blocks: got {self.block}, {self.delay_blocks}, expected at least 1 each")
-
-
-def track_learning(
-    stage: Stage,
-    reference: Reference,
-    online: OnlineModel,
-    *,
-    pid: PID | None = None,
-    state: StageState | None = None,
-    config: BlockConfig | None = None,
-) -> Run:
-    """Follow ``reference`` with the feedforward of a model that learns; ``online`` and ``state`` are advanced.
-
-    Without ``state`` the stage starts at rest. The memory starts at rest at 0 µm and is passed from block to block.
-    Limits and the integral of the feedback are handled as in ``sim.stage.closed_loop.track``.
-    """
-    config = config or BlockConfig()
-    state = state or stage.initial_state()
-    n, dt_s = reference.y_um.size, stage.config.dt_s
-    first = state.k
-    low, high = stage.config.u_min_V, stage.config.u_max_V
-    y, u, forward, feedback = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
-    snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
-    memory = snapshots[0].rest_memory(0.0)
-    fed = pid.initial_state() if pid is not None else None
-    for start in range(0, n, config.block):
-        part = slice(start, min(n, start + config.block))
-        answer = snapshots[0].feedforward(
-            reference.y_um[part], reference.v_um_per_s[part], reference.a_um_per_s2[part], memory
-        )
-        memory = answer.memory
-        forward[part] = answer.u_V
-        if pid is None or fed is None:
-            u[part] = np.clip(answer.u_V, low, high)
-            y[part], _ = stage.run(state, u[part])
-        else:
-            for k in range(part.start, part.stop):
-                y[k] = stage.read(state)[0]
-                feedback[k] = pid.step(fed, float(reference.y_um[k]) - y[k])
-                wanted = float(forward[k]) + feedback[k]
-                u[k] = min(max(wanted, low), high)
-                fed.limit(wanted, float(u[k]))
-                stage.step(state, float(u[k]))
-        for k in range(part.start, part.stop):
-            online.handle(Sample(first + k, (first + k) * dt_s, float(u[k]), float(y[k])))
-        snapshots.append(online.snapshot())
-    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
-    return Run(t_s, reference.y_um, y, u, forward, feedback)
+from dehyst.sim.stage.stage import Stage
 
 
 def replay(
@@ -127,44 +58,10 @@ def replay(
     return out
 
 
-# --- References for the controllers: the response to (2.45), the chapter's shapes, and a family that it lacks.
+# --- References for the controllers: the response to (2.45), and a family that the chapter lacks.
 
-#: Step of the central differences that give velocity and acceleration of a formula, s.
-_STEP_S = 1e-4
 #: Top of the references as a share of the motion range, so that they stay within the identified range.
 _TOP = 0.9
-
-
-def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float, dt_s: float = DT_S) -> Reference:
-    """Reference of a smooth formula y(t), µm; derivatives by central differences with 0.1 ms steps."""
-    t = sample_times(duration_s, dt_s)
-    now, before, after = formula(t), formula(t - _STEP_S), formula(t + _STEP_S)
-    return Reference(t, now, (after - before) / (2.0 * _STEP_S), (after - 2.0 * now + before) / _STEP_S**2)
-
-
-def chapter_reference(range_um: float, duration_s: float = 10.0) -> Reference:
-    """(2.45) in displacement: its decaying sweep scaled to 90 % of the motion range."""
-    scale = _TOP * range_um / 2.0
-    return from_formula(
-        lambda t: scale * np.exp(-0.14 * t) * (np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - np.pi) + 1.0), duration_s
-    )
-
-
-def training_reference(range_um: float, duration_s: float = 10.0) -> Reference:
-    """(2.37) in displacement, scaled to 90 % of the range: the motion of the training record."""
-    scale = _TOP * range_um / 2.0
-    return from_formula(
-        lambda t: scale * np.exp(-0.11 * t) * (np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 0.5 * np.pi) + 1.0),
-        duration_s,
-    )
-
-
-def sine_reference(range_um: float, frequency_Hz: float = 5.0, duration_s: float = 4.0) -> Reference:
-    """A sine from 0 to 80 % of the range, whose amplitude rises smoothly over the first half second."""
-    omega = 2.0 * np.pi * frequency_Hz
-    return from_formula(
-        lambda t: 0.4 * range_um * blend_step(np.clip(t / 0.5, 0.0, 1.0))[0] * (1.0 - np.cos(omega * t)), duration_s
-    )
 
 
 def answered_reference(record: Record) -> Reference:
@@ -178,17 +75,14 @@ def control_references(data: Experiments, quick: bool = False) -> dict[str, Refe
     """References by name; the first is that of Table 2.5, the last two are the family that the chapter lacks.
 
     The chapter only draws the reference of Fig. 2.17a. The first one here is the response of the stage to (2.45): it
-    leaves rest and returns as the stage does. The second has the same shape but returns to 0 µm each time, which the
-    training record never does. ``quick`` leaves out the two shapes in µm.
+    leaves rest and returns as the stage does. ``quick`` shortens the others.
     """
-    range_um = data.range_um
-    found = {"answer to (2.45)": answered_reference(data.generalisation)}
-    if not quick:
-        found |= {"(2.45) in µm": chapter_reference(range_um), "(2.37) in µm": training_reference(range_um)}
-    tones = demo_reference(7.0 if quick else 20.0, DT_S, (0.0, _TOP * range_um), seed=3)
-    return found | {
-        "sine 5 Hz": sine_reference(range_um, duration_s=2.0 if quick else 4.0),
-        "tones, minor loops, holds": tones,
+    end_s, top_um = 2.0 if quick else 4.0, _TOP * data.range_um
+    sine = Sequenced(((1.0, Tones(0.0)), (end_s, strokes(0.0, 0.8 * data.range_um, 5.0, 1.0))))
+    return {
+        "answer to (2.45)": answered_reference(data.generalisation),
+        "sine 5 Hz": sine.at(sample_times(end_s, DT_S)),
+        "tones, minor loops, holds": demo_reference(7.0 if quick else 20.0, DT_S, (0.0, top_um), seed=3),
     }
 
 
@@ -330,18 +224,13 @@ def run_control(
         for key, (_, base) in LEARNING.items():
             hybrid = [("FF+FB", pid)] if name == first or not quick else []
             for controller, gains in (("FF", None), *hybrid):
-                add(key, controller, name, _learnt(stage, reference, inverses[base].model, gains))
+                add(key, controller, name, track(stage, reference, online=learner_of(inverses[base].model), pid=gains))
     stable = CHAPTER_GAINS.k_p < ultimate.gain_V_per_um
     if stable:
         run = track(stage, references[first], model=inverses["lssvm_memory"].model, pid=CHAPTER_GAINS)
         add("lssvm_memory", "FF+FB, chapter's gains", first, run)
     changed = _changed(data, inverses, list(references.items())[-1], progress)
     return Control(ultimate, pid, stable, inverses, tuple(loops), changed, data.range_um)
-
-
-def _learnt(stage: Stage, reference: Reference, model: InverseModel, pid: PID | None) -> Run:
-    """A run of a learning model that starts from rest with its identified parameters."""
-    return track_learning(stage, reference, learner_of(model), pid=pid)
 
 
 def _changed(
@@ -357,7 +246,7 @@ def _changed(
         run = track(stage, reference, model=inverses[key].model)
         loops.append(Loop(key, "FF", name, run, Score.of(run.error_um[after:], data.range_um)))
     for key, (_, base) in LEARNING.items():
-        run = _learnt(stage, reference, inverses[base].model, None)
+        run = track(stage, reference, online=learner_of(inverses[base].model))
         loops.append(Loop(key, "FF", name, run, Score.of(run.error_um[after:], data.range_um)))
     return tuple(loops)
 
@@ -369,54 +258,3 @@ def moving_mae(error_um: FloatArray, range_um: float, span_s: float = 0.5) -> Fl
     at = np.arange(1, error_um.size + 1)
     since = np.maximum(at - n, 0)
     return np.asarray((total[at] - total[since]) / (at - since) * (100.0 / range_um), dtype=np.float64)
-
-
-# --- Table 2.4 for inverse models: voltages for the motion of every record, from frozen and from learning models.
-#
-# The error is a voltage. Times the mean gain of the training record it is a displacement, comparable with the errors of
-# the forward models. A learning model answers each block from a snapshot of its past.
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayRun:
-    """Scores of one inverse model by record: (2.45), then the records of the third family."""
-
-    model: str
-    scores: dict[str, Score]
-
-    @property
-    def third_mae_pct(self) -> float:
-        """Mean MAE over the third family."""
-        return float(np.mean([score.mae_pct for name, score in self.scores.items() if name != "generalisation"]))
-
-
-def replay_records(
-    data: Experiments,
-    inverses: dict[str, Inverse],
-    *,
-    quick: bool = False,
-    progress: Callable[[str], None] = lambda _: None,
-) -> tuple[ReplayRun, ...]:
-    """Scores of every frozen and learning model on all records except the training one; ``quick``: on two records."""
-    gain = float(np.polyfit(data.training.u_V, data.training.y_um, 1)[0])
-    records = (data.generalisation, *(data.third[:1] if quick else data.third))
-    progress("replaying the records through the inverse models")
-    runs = []
-    for key in FROZEN:
-        runs.append(ReplayRun(key, dict(_scores(records, inverses[key].model, False, gain, data.range_um))))
-    for key, (_, base) in LEARNING.items():
-        runs.append(ReplayRun(key, dict(_scores(records, inverses[base].model, True, gain, data.range_um))))
-    return tuple(runs)
-
-
-def _scores(
-    records: tuple[Record, ...], model: InverseModel, learns: bool, gain: float, range_um: float
-) -> Iterator[tuple[str, Score]]:
-    for record in records:
-        motion = smooth_recording(record.y_um, SmootherConfig.for_rate(DT_S))
-        if learns:
-            u = replay(learner_of(model), motion, record.u_V, record.y_um, DT_S)
-        else:
-            y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
-            u = model.feedforward(y, v, a, model.rest_memory(float(y[0]))).u_V
-        yield record.name, Score.of((u - record.u_V) * gain, range_um)

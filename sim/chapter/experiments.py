@@ -137,12 +137,9 @@ class Width:
 
 @dataclass(frozen=True, slots=True)
 class Characterisation:
-    """Data of Fig. 2.2 (each axis in turn) and Fig. 2.3; ``second_axis`` and cross-talks are None for a single axis."""
+    """Numbers of Fig. 2.2 (triangles) and Fig. 2.3 (sines); the cross-talks are None for a single axis."""
 
-    triangles: Record
-    second_axis: Record | None
     triangle_widths: tuple[Width, ...]
-    sines: tuple[Record, ...]
     sine_widths: tuple[Width, ...]
     cross_talk_pct: float | None
     cross_talk_back_pct: float | None
@@ -173,16 +170,15 @@ def characterise(config: StageConfig) -> Characterisation:
         part = slice(round(start_s / DT_S), min(u.size, round(end_s / DT_S) + 1))
         y = first.y_um[part]
         triangles.append(Width(amplitude, 1.0 / (end_s - start_s), float(np.ptp(y)), loop_width(u[part], y)))
-    sines, widths = [], []
+    widths = []
     for frequency in FREQUENCIES_HZ:
         run = record(stage, f"{frequency:g} Hz", voltages.sine(0.0, _SINE_V, frequency, _CYCLES, DT_S)[1])
         last = slice(run.u_V.size - round(1.0 / (frequency * DT_S)), run.u_V.size)
-        sines.append(run)
         stroke = float(np.ptp(run.y_um[last]))
         widths.append(Width(_SINE_V, frequency, stroke, loop_width(run.u_V[last], run.y_um[last])))
     talk = _share(first.y2_um, first.y_um) if second is not None else None
     back = _share(second.y_um, second.y2_um) if second is not None else None
-    return Characterisation(first, second, tuple(triangles), tuple(sines), tuple(widths), talk, back)
+    return Characterisation(tuple(triangles), tuple(widths), talk, back)
 
 
 def _share(of_um: FloatArray, by_um: FloatArray) -> float:

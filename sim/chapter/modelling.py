@@ -20,7 +20,6 @@ from dehyst.baselines.bouc_wen.model import BoucWenParameters
 from dehyst.baselines.prandtl_ishlinskii.identify import identify_mpi
 from dehyst.baselines.prandtl_ishlinskii.model import MpiParameters
 from dehyst.baselines.swarm import SwarmConfig, swarm_bouc_wen, swarm_mpi
-from dehyst.sim.chapter import published
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
 from dehyst.sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs
 
@@ -122,7 +121,7 @@ class ForwardRun:
     key, label, route : short name, name for people, and method of identification.
     parameters : number of identified parameters. seconds : duration of the identification, s.
     training, generalisation : scores on (2.37) and (2.45). third : by record of the third family.
-    training_um, generalisation_um : model outputs at the 0.02 s samples, µm.
+    generalisation_um : model outputs on (2.45) at the 0.02 s samples, µm.
     """
 
     key: str
@@ -134,7 +133,6 @@ class ForwardRun:
     training: Score
     generalisation: Score
     third: dict[str, Score]
-    training_um: FloatArray
     generalisation_um: FloatArray
 
     @property
@@ -159,11 +157,11 @@ def judge(
         out = predict(model, record.u_V)
         return Score.of(out - record.coarse_y_um, data.range_um), out
 
-    training, training_um = of(data.training)
+    training, _ = of(data.training)
     generalisation, generalisation_um = of(data.generalisation)
     third = {record.name: of(record)[0] for record in data.third}
     identified = key, label, route, model, parameters, seconds
-    return ForwardRun(*identified, training, generalisation, third, training_um, generalisation_um)
+    return ForwardRun(*identified, training, generalisation, third, generalisation_um)
 
 
 def identify_forward(
@@ -202,8 +200,5 @@ def identify_forward(
         "mpi_lag", "MPI with a lag", "non-negative least squares", 21, lambda: identify_mpi(u, y, dt_s, fit_lag=True)[0]
     )
     add("lssvm", "LSSVM (u, du/dt)", "three-level inference", 2, lambda: fit_two_inputs(u, y))
-    given = published.FORWARD_HYPER
-    text = f"gamma {given[0]:g}, sigma {given[1]:g} given"
-    add("lssvm_given", "LSSVM (u, du/dt)", text, 2, lambda: fit_two_inputs(u, y, given))
     add("lssvm_memory", "LSSVM with memory", "prior and evidence", 6, lambda: fit_memory(data.training.u_V, y))
     return runs

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
-from dehyst.sim.recordings.columns import ColumnMap, stated_unit
+from dehyst.sim.recordings.columns import ColumnMap
 from dehyst.sim.recordings.table import MAX_BYTES, Table, seconds
 from dehyst.sim.recordings.text_cells import (
     different,
@@ -32,14 +32,12 @@ from dehyst.sim.recordings.text_cells import (
     units_row,
 )
 
-#: Lines from which the layout is found, and rows that are converted at a time.
+#: Lines from which the layout is found; the same where these hold a long preamble only; and lines read at a time.
 _HEAD_LINES: Final = 400
-#: The same where these hold a long preamble only.
 _LONG_HEAD_LINES: Final = 20_000
 _BLOCK_ROWS: Final = 200_000
-#: Delimiters in the order in which they are tried; a blank stands for any number of blanks.
-_DELIMITERS: Final = ("\t", ";", ",", "|", " ")
-_NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", "|": "'|'", " ": "blanks"}
+#: Delimiters in the order in which they are tried, with their names; a blank stands for any number of blanks.
+_DELIMITERS: Final = {"\t": "tabs", ";": "';'", ",": "','", "|": "'|'", " ": "blanks"}
 #: Words for a missing value.
 _MISSING: Final = frozenset({
     "", "na", "n/a", "#n/a", "nan", "-nan", "1.#qnan", "-1.#ind", "null", "none", "-", "--", "---", "----", "*",
@@ -50,18 +48,13 @@ _MISSING: Final = frozenset({
 _TIME_OF_DAY: Final = re.compile(
     r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,:]\d*)?)(?: ?([AaPp])[Mm])?"
 )
-#: A number with thousands separated, by its decimal sign. ``1.000`` alone is one only where points are no decimals.
-_THOUSANDS: Final = {
-    ",": re.compile(r"[+-]?[1-9]\d{0,2}((\.\d{3}){2,}(,\d+)?|(\.\d{3})+,\d+|(['\u2019\u00a0\u202f ]\d{3})+(,\d+)?)"),
-    ".": re.compile(r"[+-]?[1-9]\d{0,2}((,\d{3}){2,}(\.\d+)?|(,\d{3})+\.\d+|(['\u2019\u00a0\u202f ]\d{3})+(\.\d+)?)"),
-}
-_ONE_THOUSAND: Final = {",": re.compile(r"[+-]?[1-9]\d{0,2}\.\d{3}"), ".": re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")}
-#: What separates thousands, with its name for people.
-_SEPARATORS: Final = {
-    ".": "points", ",": "commas", "'": "apostrophes", "\u2019": "apostrophes", "\u00a0": "blanks",
-    "\u202f": "blanks", " ": "blanks",
-}  # fmt: skip
 _DATE: Final = re.compile(r"(\d{4}-\d{2}-\d{2}(?:[T ]\d{2}:\d{2}(?::\d{2}(?:\.\d*)?)?)?) ?(?:Z|UTC|[+-]\d{2}:?\d{2})?")
+#: What may stand between thousands, by the decimal sign, and a number with it.
+_SEPARATORS: Final = {",": ".'\u2019\u00a0\u202f ", ".": ",'\u2019\u00a0\u202f "}
+_THOUSANDS: Final = {
+    sign: re.compile(rf"[+-]?[1-9]\d{{0,2}}([{between}])\d{{3}}(\1\d{{3}})*([{sign}]\d+)?")
+    for sign, between in _SEPARATORS.items()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,35 +125,50 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """The rows of a head under one delimiter and decimal sign: the first line of them, and the kind of each column."""
+    """The rows of a head under one delimiter and decimal sign.
+
+    first : index of the first line. kinds : of each column. rows : their number. grouped : whether thousands are
+    separated.
+    """
 
     delimiter: str
     decimal: str
     first: int
     kinds: str
     rows: int
+    grouped: bool
+
+    @property
+    def rank(self) -> tuple[int, bool]:
+        """The reading with the highest rank is taken: many numbers, no texts, and the plainer one of two."""
+        return self.rows * (len(self.kinds.replace("e", "")) - 2 * self.kinds.count("t")), not self.grouped
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Positions of the columns that are not empty, as behind a trailing delimiter and in front of a preamble."""
+        return tuple(j for j, kind in enumerate(self.kinds) if kind != "e")
 
 
 def find_layout(source: str, lines: list[str], encoding: str, mapping: ColumnMap) -> Layout:
     """The layout of a file by its first ``lines``. Raises InputError where it has none, or may be read in two ways."""
-    if not any(line.strip() for line in lines):
-        raise InputError(f"{source}: got no data, expected a header line and one row per sample")
     named = _named_line(source, lines, mapping)
-    delimiters = (mapping.delimiter,) if mapping.delimiter else _DELIMITERS
-    decimals = (mapping.decimal,) if mapping.decimal else (".", ",")
     found = [
         block
-        for delimiter in delimiters
-        for decimal in decimals
+        for delimiter in ((mapping.delimiter,) if mapping.delimiter else _DELIMITERS)
+        for decimal in ((mapping.decimal,) if mapping.decimal else (".", ","))
         # Numbers with a decimal comma between commas stand in quotes.
         if (not delimiter == decimal == "," or any('"' in line for line in lines))
         and (block := _block(lines, delimiter, decimal, named))
     ]
-    # The reading with the most numbers; of equal ones the first. One with more texts than numbers is none.
-    best = max(found, key=_numbers, default=None)
-    if best is None or _numbers(best) <= 0:
+    best = max(found, key=lambda block: block.rank, default=None)
+    if best is None or best.rank[0] <= 0:
         raise InputError(f"{source}: {_why_no_rows(lines, mapping)}")
-    return _layout(source, lines, encoding, mapping, best, named)
+    names, units, notes = _names(source, lines, mapping, best, named)
+    kinds = "".join(best.kinds[j] for j in best.columns)
+    return Layout(
+        best.delimiter, best.decimal, best.first, len(best.kinds), best.columns, tuple(names), kinds, units,
+        (*_said(encoding, best, mapping, lines), *notes),
+    )  # fmt: skip
 
 
 def _named_line(source: str, lines: list[str], mapping: ColumnMap) -> int | None:
@@ -182,22 +190,23 @@ def _is_comment(line: str) -> bool:
     return line.lstrip()[:1] in ("#", "%") or not line.strip()
 
 
-def _kind(cell: str, decimal: str, grouped: bool = False) -> str:
-    """n: number, e: empty or missing, d: a date or time of day, t: any other text.
-
-    ``grouped`` : whether other cells show that thousands are separated.
-    """
+def _kind(cell: str, decimal: str) -> str:
+    """n: number, e: empty or missing, d: a date or time of day, t: any other text."""
     if cell.casefold() in _MISSING:
         return "e"
-    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _grouped(cell, decimal, grouped):
+    if _number(cell, decimal) is not None:
         return "n"
-    return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY)) else "t"
+    return "d" if _DATE.fullmatch(cell) or _TIME_OF_DAY.fullmatch(cell) else "t"
 
 
-def _grouped(cell: str, decimal: str, known: bool) -> bool:
-    """Whether a cell is a number with its thousands separated; ``known``: others show that they are."""
+def _number(cell: str, decimal: str) -> float | None:
+    """A cell as a number, also one with its thousands separated; None where it is none."""
     plain = plain_number(cell)
-    return bool(_THOUSANDS[decimal].fullmatch(plain) or (known and _ONE_THOUSAND[decimal].fullmatch(plain)))
+    if _THOUSANDS[decimal].fullmatch(plain):
+        plain = plain.translate(dict.fromkeys(map(ord, _SEPARATORS[decimal])))
+    elif decimal == "," and "." in plain:
+        return None
+    return float(plain.replace(decimal, ".")) if is_number(plain, decimal) else None
 
 
 def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) -> _Block | None:
@@ -208,20 +217,15 @@ def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) ->
     """
     least = 0 if named is None else named + 1
     cells = [(k, split_cells(line, delimiter)) for k, line in enumerate(lines) if k >= least and not _is_comment(line)]
-    grouped = any(_grouped(cell, decimal, False) for _, row in cells for cell in row)
-    rows = [(k, [_kind(cell, decimal, grouped) for cell in row]) for k, row in cells]
+    rows = [(k, [_kind(cell, decimal) for cell in row]) for k, row in cells]
     while rows and "n" not in rows[-1][1]:  # names without samples, or a last row that was cut off
         rows.pop()
     if not rows:
         return None
-    width = len(rows[-1][1])
-    if len(rows) > 1 and width < len(rows[-2][1]) and "n" in rows[-2][1]:
-        width = len(rows[-2][1])
+    width = max(len(row) for _, row in rows[-2:] if "n" in row)
     same = [(k, kinds) for k, kinds in rows if len(kinds) == width]
     kinds = "".join(_common([row[j] for _, row in same[-10:]]) for j in range(width))
     numbers = [j for j in range(width) if kinds[j] == "n"]
-    if not numbers:
-        return None
     fits = [
         k
         for k, row in same
@@ -229,18 +233,17 @@ def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) ->
         and all(row[j] in "de" for j in range(width) if kinds[j] == "d")
         and 2 * sum(row[j] in "ne" for j in numbers) >= len(numbers)
         and any(row[j] == "n" for j in numbers)
-    ]
-    return _Block(delimiter, decimal, fits[0], kinds, len(fits)) if fits else None
+    ] if numbers else []  # fmt: skip
+    if not fits:
+        return None
+    grouped = any(_THOUSANDS[decimal].fullmatch(plain_number(cell)) for k, row in cells if k >= fits[0] for cell in row)
+    return _Block(delimiter, decimal, fits[0], kinds, len(fits), grouped)
 
 
 def _common(kinds: list[str]) -> str:
     """The kind of a column by those of its cells: the most frequent one that is not empty."""
     filled = [kind for kind in kinds if kind != "e"]
     return max(sorted(set(filled)), key=filled.count) if filled else "e"
-
-
-def _numbers(block: _Block) -> int:
-    return block.rows * (len(block.kinds.replace("e", "")) - 2 * block.kinds.count("t"))
 
 
 def _why_no_rows(lines: list[str], mapping: ColumnMap) -> str:
@@ -258,105 +261,80 @@ def _why_no_rows(lines: list[str], mapping: ColumnMap) -> str:
     )
 
 
-def _layout(
-    source: str, lines: list[str], encoding: str, mapping: ColumnMap, block: _Block, named: int | None
-) -> Layout:
-    # A trailing delimiter makes an empty last column; a preamble in front of the samples empty first ones.
-    columns = tuple(j for j, kind in enumerate(block.kinds) if kind != "e") or tuple(range(len(block.kinds)))
-    start = block.first
-    above = [k for k in range(start) if lines[k].strip()]
-    notes: list[str] = []
-    names: list[str] | None = None
-    units: dict[str, str] = {}
-    if named is None and above:
-        names, units, notes = _names_above(source, lines, mapping, block, columns, above)
-    elif named is None:
-        first = split_cells(lines[start], block.delimiter)
-        if len(columns) == len(block.kinds):
-            _refuse_unclear(source, first, mapping, start + 1)
-    elif named >= 0:
-        cells = _cells_of(lines[named], block.delimiter, strip=True)
-        stated = _fitting(cells, block, columns)
-        if stated is None:
-            raise InputError(
-                f"{source}: is not a table of {len(cells)} columns as line {named + 1} names them: the rows below have "
-                f"{len(columns)}"
-            )
-        names = different(stated)
-        below = next((k for k in above if k > named), None)
-        units = {} if below is None else units_row(names, _fit(lines[below], block, columns))
-        if units and below is not None:
-            notes.append(_units_note(below, units))
-    if names is None:
-        names = [str(j + 1) for j in columns]
-        notes.append("no names of columns in the file: they are called by their position, from 1")
-    kinds = "".join(block.kinds[j] if block.kinds[j] != "e" else "n" for j in columns)
-    said = _said(encoding, block, mapping, start, above, lines)
-    separators = {
-        _SEPARATORS[sign]
-        for line in lines[start:]
-        for cell in split_cells(line.strip("\r\n"), block.delimiter)
-        if _grouped(cell, block.decimal, False)
-        for sign in _SEPARATORS.keys() - {block.decimal}
-        if sign in cell
-    }
-    if separators:
-        notes.append(f"thousands separated by {', '.join(sorted(separators))}")
-    return Layout(
-        block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, (*said, *notes)
-    )  # fmt: skip
-
-
-def _cells_of(line: str, delimiter: str, *, strip: bool = False) -> list[str]:
-    cells = split_cells(line.strip("\r\n").lstrip("#% ") if strip else line, delimiter)
+def _fitting(line: str, block: _Block) -> list[str]:
+    """The cells of a line above the samples, one for each column; none where they do not fit."""
+    text, columns = line.strip("\r\n").lstrip("#% "), block.columns
+    cells = split_cells(text.rstrip() if block.delimiter == " " else text, block.delimiter)
     while cells and not cells[-1]:
         cells.pop()
-    return cells
-
-
-def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...]) -> list[str] | None:
-    """The name of each column from the cells of a line; None where they do not fit."""
-    if len(cells) == len(columns):
-        return cells
+    if len(cells) != len(columns) and block.delimiter == " ":
+        # Names with blanks in them stand further apart.
+        cells = re.split(r"\s{2,}|\t", text.strip())
     if columns[-1] < len(cells) <= len(block.kinds) and all(cells[j] for j in columns):
         return [cells[j] for j in columns]
-    return None
+    return cells if len(cells) == len(columns) else []
 
 
-def _fit(line: str, block: _Block, columns: tuple[int, ...]) -> list[str]:
-    found = _fitting(_cells_of(line, block.delimiter, strip=True), block, columns)
-    if found is None and block.delimiter == " ":
-        # Names with blanks in them stand further apart; SPEC's begin with #L.
-        text = line.strip().removeprefix("#L ").lstrip("#% ")
-        found = _fitting(re.split(r"\s{2,}|\t", text), block, columns)
-    return found or []
+def _names(
+    source: str, lines: list[str], mapping: ColumnMap, block: _Block, named: int | None
+) -> tuple[list[str], dict[str, str], list[str]]:
+    """Names and units of the columns by the lines above the samples, and what to tell the user."""
+    above = [k for k in range(block.first) if lines[k].strip()]
+    stated: int | None = None
+    if named is None and above:
+        named = above[-1]
+        # Above a row of units stand the names, also such as are numbers of channels.
+        if len(above) > 1 and _units(lines, block, *above[-2:]):
+            named, stated = above[-2:]
+    elif named is None:
+        if len(block.columns) == len(block.kinds):
+            _refuse_unclear(source, split_cells(lines[block.first], block.delimiter), mapping, block.first + 1)
+    elif named >= 0:
+        stated = next((k for k in above if k > named), None)
+    names = _fitting(lines[named], block) if named is not None and named >= 0 else []
+    if mapping.header not in (None, "none") and not names:
+        raise InputError(
+            f"{source}: is not a table of {len(split_cells(lines[named or 0], block.delimiter))} columns as line "
+            f"{mapping.header} names them: the rows below have {len(block.columns)}"
+        )
+    notes: list[str] = []
+    if mapping.header is None and stated is None and named is not None:
+        names = _sure_names(source, lines, mapping, block, above, names)
+        if names and _is_comment(lines[named]):
+            notes.append(f"columns named by the comment above the samples: {', '.join(names)}")
+    if not names:
+        without = "no names of columns in the file: they are called by their position, from 1"
+        return [str(j + 1) for j in block.columns], {}, [without]
+    units = {} if named is None or stated is None else _units(lines, block, named, stated)
+    if units and stated is not None:
+        listed = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        notes.append(f"units from line {stated + 1}: {listed}")
+    return different(names), units, notes
 
 
-def _names_above(
-    source: str, lines: list[str], mapping: ColumnMap, block: _Block, columns: tuple[int, ...], above: list[int]
-) -> tuple[list[str] | None, dict[str, str], list[str]]:
-    """Names and units of the columns from the lines directly above the samples, and what to tell the user."""
+def _units(lines: list[str], block: _Block, named: int, stated: int) -> dict[str, str]:
+    """name -> unit, where line ``named`` holds names and line ``stated`` units; else empty."""
+    names = _fitting(lines[named], block)
+    return units_row(different(names), _fitting(lines[stated], block)) if names and all(names) else {}
+
+
+def _sure_names(
+    source: str, lines: list[str], mapping: ColumnMap, block: _Block, above: list[int], cells: list[str]
+) -> list[str]:
+    """``cells`` of the line directly above the samples where they are names, else none. Raises InputError."""
     last = above[-1]
-    cells = _fit(lines[last], block, columns)
-    if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
+    numbers = any(is_number(cell, block.decimal) for cell in cells)
+    if len(cells) > 2 and not cells[0] and all(cells[1:]) and not numbers:
         # As pandas writes its index: the first column has no name.
-        cells[0] = "index"
-    if named := _names_and_units(lines, block, columns, above):
-        return named
+        cells = ["index", *cells[1:]]
     if not cells or not all(cells):
         _refuse_commas_between_commas(source, lines[last], block)
-        return None, {}, []
-    if lines[last].lstrip()[:1] in ("#", "%"):
-        if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells):
-            return None, {}, []
-        return cells, {}, [f"columns named by the comment above the samples: {', '.join(cells)}"]
-    if any(is_number(cell, block.decimal) for cell in cells):
-        if all(_is_comment(lines[k]) for k in above[:-1]):
-            _refuse_unclear(source, cells, mapping, last + 1)
-        return None, {}, []
-    if any(_kind(cell, block.decimal) == "d" for cell in cells):
-        return None, {}, []
-    return different(cells), {}, []
+        return []
+    if _is_comment(lines[last]):
+        return [] if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells) else cells
+    if numbers and all(_is_comment(lines[k]) for k in above[:-1]):
+        _refuse_unclear(source, cells, mapping, last + 1)
+    return [] if numbers or any(_kind(cell, block.decimal) == "d" for cell in cells) else cells
 
 
 def _refuse_unclear(source: str, cells: list[str], mapping: ColumnMap, number: int) -> None:
@@ -373,7 +351,7 @@ def _refuse_unclear(source: str, cells: list[str], mapping: ColumnMap, number: i
 
 def _refuse_commas_between_commas(source: str, line: str, block: _Block) -> None:
     """Raise InputError where each name stands above two cells: numbers with decimal commas between commas."""
-    names = _cells_of(line, block.delimiter)
+    names = split_cells(line.strip("\r\n"), block.delimiter)
     if block.delimiter == "," and 2 * len(names) == len(block.kinds) > 2 and not any(is_number(n, ".") for n in names):
         raise InputError(
             f"{source}: got {len(names)} names and {len(block.kinds)} cells a line, expected as many: decimal commas "
@@ -381,42 +359,20 @@ def _refuse_commas_between_commas(source: str, line: str, block: _Block) -> None
         )
 
 
-def _names_and_units(
-    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
-) -> tuple[list[str], dict[str, str], list[str]] | None:
-    """Names above a row of units: directly above the samples, or further up where every column has a unit."""
-    for k, (named, stated) in reversed(list(enumerate(itertools.pairwise(above), 2))):
-        upper = _fit(lines[named], block, columns)
-        if not upper or not all(upper):
-            continue
-        names = different(upper)
-        units = units_row(names, _fit(lines[stated], block, columns))
-        # Above a whole row of units, numbers are names of channels.
-        plain = not any(is_number(cell, block.decimal) for cell in upper)
-        whole = len(units) == len(names) and all(map(stated_unit, units.values()))
-        if whole or (units and plain and k == len(above)):
-            return names, units, [_units_note(stated, units)]
-    return None
-
-
-def _units_note(line: int, units: dict[str, str]) -> str:
-    return f"units from line {line + 1}: {', '.join(f'{name} in {unit}' for name, unit in units.items())}"
-
-
-def _said(
-    encoding: str, block: _Block, mapping: ColumnMap, start: int, above: list[int], lines: list[str]
-) -> list[str]:
+def _said(encoding: str, block: _Block, mapping: ColumnMap, lines: list[str]) -> list[str]:
     """What was found and is not the plainest case, as a note."""
     found = []
     if encoding not in ("utf-8", "utf-8-sig"):
         found.append(f"letters in {encoding.upper()}")
     if mapping.delimiter is None and block.delimiter != "," and len(block.kinds) > 1:
-        found.append(f"columns separated by {_NAMES[block.delimiter]}")
+        found.append(f"columns separated by {_DELIMITERS[block.delimiter]}")
     if mapping.decimal is None and block.decimal == ",":
         found.append("decimal commas")
-    preamble = [k for k in above if not _is_comment(lines[k])]
-    if len(preamble) > 2:
-        found.append(f"samples from line {start + 1} on, below {len(preamble)} lines of a preamble")
+    if block.grouped:
+        found.append("thousands separated")
+    preamble = sum(not _is_comment(line) for line in lines[: block.first])
+    if preamble > 2:
+        found.append(f"samples from line {block.first + 1} on, below {preamble} lines of a preamble")
     return ["text: " + ", ".join(found)] if found else []
 
 
@@ -431,95 +387,79 @@ class _Rows:
         self.n = 0
         self.notes: list[str] = []
         self._line = layout.start
-        self._numbers = [i for i, kind in enumerate(layout.kinds) if kind == "n"]
-        #: By column: the blocks of its numbers, or its texts.
-        self._blocks: dict[int, list[FloatArray]] = {i: [] for i in self._numbers}
-        self._texts: dict[int, list[str]] = {i: [] for i, kind in enumerate(layout.kinds) if kind != "n"}
-        #: Cells that are no numbers in columns of numbers: column -> row -> text.
-        self._wrong: dict[int, dict[int, str]] = {}
-        self._whole = len(self._numbers) == layout.width
+        #: By column its blocks of numbers or of texts; numbers have dtype object where a cell is none.
+        self._blocks: list[list[NDArray[Any]]] = [[] for _ in layout.names]
 
     def add(self, lines: list[str], *, last: bool) -> None:
         """Take the next lines of the file; ``last`` says that there are no more."""
-        numbered = self._line
+        numbered, kinds = self._line, self.layout.kinds
         self._line += len(lines)
-        block = None if self._texts else self._fast(lines)
+        block: FloatArray | list[NDArray[Any]] | None = self._fast(lines)
         if block is None:
-            block = self._slow(lines, numbered, last)
-        self.n += block.shape[1]
-        if self.n * 8 * max(1, len(self._numbers)) > MAX_BYTES:
+            rows = self._cells(lines, numbered, last)
+            texts = [[row[j] for row in rows] for j in self.layout.columns]
+            block = [
+                self._numbers(cells) if kind == "n" else np.array(cells)
+                for kind, cells in zip(kinds, texts, strict=True)
+            ]
+        self.n += len(block[0])
+        if self.n * 8 * len(kinds) > MAX_BYTES:
             raise InputError(
                 f"{self.source}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
                 "leave out columns that are not needed"
             )
-        for i, values in zip(self._numbers, block, strict=True):
-            self._blocks[i].append(np.ascontiguousarray(values))
+        for blocks, values in zip(self._blocks, block, strict=True):
+            blocks.append(np.ascontiguousarray(values))
 
     def _fast(self, lines: list[str]) -> FloatArray | None:
         """(k, n) numbers by the compiled reader; None where a line is not k numbers."""
-        layout = self.layout
-        first = next((line for line in lines if line.strip()), None)
-        if first is None:
-            return np.empty((len(self._numbers), 0))
-        delimiter = None if layout.delimiter == " " else layout.delimiter
-        if not self._whole and delimiter is not None:
-            count = layout.width - 1
-            if any(line.count(delimiter) != count for line in lines if line.strip()):
-                return None
+        layout, decimal = self.layout, self.layout.decimal
         # A point beside decimal commas separates thousands.
-        if layout.delimiter == layout.decimal or (layout.decimal == "," and any("." in line for line in lines)):
+        points = decimal == "," and (layout.delimiter == "," or any("." in line for line in lines))
+        if layout.kinds.strip("n") or points or all(not line.strip() for line in lines):
             return None
-        source = (line.replace(",", ".") for line in lines) if layout.decimal == "," else lines
-        usecols = None if self._whole else [layout.columns[i] for i in self._numbers]
+        delimiter = None if layout.delimiter == " " else layout.delimiter
+        count = layout.width - 1
+        if delimiter and any(line.count(delimiter) != count for line in lines if line.strip()):
+            return None
+        source = (line.replace(",", ".") for line in lines) if decimal == "," else lines
+        usecols = None if len(layout.columns) == layout.width else layout.columns
         try:
             table = np.loadtxt(source, delimiter=delimiter, comments=None, quotechar='"', ndmin=2, usecols=usecols)
         except ValueError:
             return None
-        return table.T if table.shape[1] == len(self._numbers) else None
+        return table.T if table.shape[1] == len(layout.columns) else None
 
-    def _slow(self, lines: list[str], numbered: int, last: bool) -> FloatArray:
-        """The same cell by cell: empty ones become NaN, texts are kept, and a wrong row is named."""
-        layout = self.layout
-        rows: list[list[str]] = []
+    def _cells(self, lines: list[str], numbered: int, last: bool) -> list[list[str]]:
+        """The cells of the rows, the first of which is line ``numbered`` + 1. Raises InputError on a wrong row."""
+        layout, rows = self.layout, list[list[str]]()
         for k, line in enumerate(lines, numbered + 1):
             if _is_comment(line):
                 continue
             cells = split_cells(line.strip("\r\n"), layout.delimiter)
-            if len(cells) > layout.width and not any(cells[layout.width :]):
-                cells = cells[: layout.width]
-            if len(cells) < layout.width and layout.columns[-1] < len(cells):
-                cells += [""] * (layout.width - len(cells))
-            if len(cells) != layout.width:
-                if last and k == numbered + len(lines) and len(cells) < layout.width and not line.endswith("\n"):
-                    self.notes.append(f"the last line ({k}) is cut off and left out")
-                    continue
+            whole = layout.columns[-1] < len(cells) and not any(cells[layout.width :])
+            if whole:
+                rows.append(cells + [""] * (layout.width - len(cells)))
+            elif last and k == numbered + len(lines) and len(cells) < layout.width and not line.endswith("\n"):
+                self.notes.append(f"the last line ({k}) is cut off and left out")
+            else:
                 raise InputError(
                     f"{self.source}: is not a table of {len(layout.columns)} columns: line {k} has {len(cells)} cells "
                     f"({line.strip()[:60]!r}), expected {layout.width}"
                 )
-            rows.append(cells)
-        block = np.empty((len(self._numbers), len(rows)))
-        for at, i in enumerate(self._numbers):
-            block[at] = self._column(i, [row[layout.columns[i]] for row in rows])
-        for i, texts in self._texts.items():
-            texts.extend(row[layout.columns[i]] for row in rows)
-        return block
+        return rows
 
-    def _column(self, i: int, cells: list[str]) -> FloatArray:
-        comma = self.layout.decimal == ","
-        if not (comma and any("." in cell for cell in cells)):
-            try:
-                return np.array([cell.replace(",", ".") for cell in cells] if comma else cells, dtype=np.float64)
-            except ValueError:
-                pass
-        values = np.full(len(cells), np.nan)
-        for row, cell in enumerate(cells):
-            value = _number(cell, self.layout.decimal)
-            if value is not None:
-                values[row] = value
-            elif cell.casefold() not in _MISSING:
-                self._wrong.setdefault(i, {})[self.n + row] = cell
-        return values
+    def _numbers(self, cells: list[str]) -> NDArray[Any]:
+        """Cells as numbers (n,), NaN where there is none; a cell that is no number stays as it is."""
+        decimal = self.layout.decimal
+        with contextlib.suppress(ValueError):
+            if decimal == "." or not any("." in cell for cell in cells):
+                return np.array([cell.replace(decimal, ".") for cell in cells], dtype=np.float64)
+        values: list[Any] = []
+        for cell in cells:
+            value = _number(cell, decimal)
+            values.append(value if value is not None else np.nan if cell.casefold() in _MISSING else cell)
+        return np.array(values, dtype=object if any(isinstance(value, str) for value in values) else np.float64)
 
     def table(self) -> Table:
         """The columns by name; times of day and dates are seconds. Raises InputError where there are no rows."""
@@ -531,56 +471,34 @@ class _Rows:
             )
         found: dict[str, NDArray[Any]] = {}
         units = dict(layout.units)
-        for i, name in enumerate(layout.names):
-            if i in self._texts:
-                found[name], times = _times_or_texts(self._texts[i])
-                if times:
-                    units[name] = "s"
-                continue
-            values: NDArray[Any] = np.concatenate(self._blocks.pop(i))
-            if i in self._wrong:
-                values = values.astype(object)
-                for row, text in self._wrong[i].items():
-                    values[row] = text
-            found[name] = values
+        for name, kind, blocks in zip(layout.names, layout.kinds, self._blocks, strict=True):
+            found[name] = np.concatenate(blocks)
+            blocks.clear()
+            if kind != "n" and (times := _times(found[name].tolist())) is not None:
+                found[name], units[name] = times, "s"
         return Table(self.source, found, notes=(*layout.notes, *self.notes), units=units, positional=True)
 
 
-def _number(cell: str, decimal: str) -> float | None:
-    """A cell as a number; None where it is none."""
-    plain = plain_number(cell)
-    if _grouped(cell, decimal, True):
-        plain = "".join(sign for sign in plain if sign == decimal or sign not in _SEPARATORS)
-    elif decimal == "," and "." in plain:
-        return None
-    try:
-        return float(plain.replace(",", ".") if decimal == "," else plain)
-    except ValueError:
-        return None
-
-
-def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
-    """Dates or times of day (n,) as seconds since the first and True, or the texts and False."""
+def _times(cells: list[str]) -> FloatArray | None:
+    """Dates or times of day (n,) as seconds since the first; None where they are other texts."""
     filled = [cell for cell in cells if cell]
     dates = [_DATE.fullmatch(cell) for cell in cells]
     if filled and all(date for cell, date in zip(cells, dates, strict=True) if cell):
         try:
-            return seconds(np.array([date[1] if date else "NaT" for date in dates], dtype="datetime64[ns]")), True
+            return seconds(np.array([date[1] if date else "NaT" for date in dates], dtype="datetime64[ns]"))
         except ValueError:
-            return np.array(cells), False
-    if filled and all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
-        of_day = np.array(list(_seconds_of_day(cells)))
-        # Midnight is no step back.
-        days = np.concatenate([[0.0], np.cumsum(np.diff(of_day) < -43_200.0)]) * 86_400.0
-        return of_day + days - of_day[0], True
-    return np.array(cells), False
+            return None
+    if not filled or not all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
+        return None
+    of_day = np.array([_second_of_day(cell) for cell in cells])
+    # Midnight is no step back.
+    days = np.concatenate([[0.0], np.cumsum(np.diff(of_day) < -43_200.0)]) * 86_400.0
+    return np.asarray(of_day + days - of_day[0])
 
 
-def _seconds_of_day(cells: list[str]) -> Iterator[float]:
-    for cell in cells:
-        match = _TIME_OF_DAY.fullmatch(cell)
-        if match is None:
-            yield np.nan
-            continue
-        hour = int(match[1]) if match[4] is None else int(match[1]) % 12 + 12 * (match[4] in "Pp")
-        yield 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", ".").replace(":", "."))
+def _second_of_day(cell: str) -> float:
+    match = _TIME_OF_DAY.fullmatch(cell)
+    if match is None:
+        return np.nan
+    hour = int(match[1]) if match[4] is None else int(match[1]) % 12 + 12 * (match[4] in "Pp")
+    return 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", ".").replace(":", "."))

@@ -65,7 +65,7 @@ def sample_times(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, 
     """Time of each of ``n`` samples and the nominal sample time, s, from an option, a column, or the format."""
     reading = _Reading(table, {}, mapping)
     reading.names = {name: name for name in table.arrays}
-    return reading._time(table.source, n, [])
+    return reading._time(table.source, n)
 
 
 def _main_table(path: Path, mapping: ColumnMap, digest: Any) -> Table:
@@ -231,9 +231,9 @@ class _Reading:
         if missing:
             missing += self._missing_time()
             raise missing[0] if len(missing) == 1 else _all_missing(source, self.main.describe(), missing)
-        n, periods = self._repeat(source, columns)
+        n = self._repeat(source, columns)
         named = {QUANTITIES[quantity][0]: values for quantity, values in columns.items()}
-        named["t_s"], dt_s = self._time(source, n, periods)
+        named["t_s"], dt_s = self._time(source, n)
         if "seq" in self.main.arrays and self.main.arrays["seq"].dtype.kind in "iu":
             named["seq"] = self.main.arrays["seq"].astype(np.int64)
         if "reason" in self.main.arrays:
@@ -321,17 +321,14 @@ class _Reading:
 
     def _missing_time(self) -> list[MissingError]:
         """What is missing for the time, where other things are missing too."""
-        if self.main.dt_s is not None or self.main.clocks:
-            return []
         n = max((array.shape[0] for array in self.main.arrays.values() if array.ndim), default=0)
-        if n < 2:
-            return []
         try:
-            self._time(self.main.source, n, [])
+            if n > 1 and not self.main.clocks:
+                self._time(self.main.source, n)
         except MissingError as error:
             return [error]
         except InputError:
-            return []
+            pass
         return []
 
     def _column(self, quantity: str, *, needed: bool) -> FloatArray | None:
@@ -365,12 +362,12 @@ class _Reading:
             self.notes.append(f"{quantity} is an angle: µrad stand where µm is written")
         return values if factor == 1.0 else values * factor
 
-    def _repeat(self, source: str, columns: dict[str, NDArray[Any] | None]) -> tuple[int, list[int]]:
-        """Repeat the periods in ``columns``. Returns the number of samples, and the lengths of the periods."""
+    def _repeat(self, source: str, columns: dict[str, NDArray[Any] | None]) -> int:
+        """Repeat the periods in ``columns``. Returns the number of samples."""
         u, y = columns["u"], columns["y"]
         assert u is not None
         assert y is not None
-        n, periods = max(len(u), len(y)), []
+        n = max(len(u), len(y))
         for quantity in self.mapping.repeat:
             period = columns[quantity]
             if period is None or not 0 < len(period) <= n:
@@ -379,7 +376,6 @@ class _Reading:
             if len(period) < n:
                 times = f"{n / len(period):.4g} times" + (", the last one in part" if n % len(period) else "")
                 self.notes.append(f"{quantity}: its {len(period)} samples are one period and are repeated {times}")
-                periods.append(len(period))
                 columns[quantity] = np.resize(period, n)
         u_n, y_n = len(columns["u"]), len(columns["y"])  # type: ignore[arg-type]
         if u_n != y_n:
@@ -390,13 +386,13 @@ class _Reading:
                 f"{quantity} if its {short} samples{whole} are one period of a periodic recording; otherwise cut or "
                 "resample one of them"
             )
-        return n, periods
+        return n
 
-    def _time(self, source: str, n: int, periods: list[int]) -> tuple[FloatArray, float]:
+    def _time(self, source: str, n: int) -> tuple[FloatArray, float]:
         """Time of each sample and the nominal sample time, s, from an option, a column, or the format."""
         dt_s = self.mapping.dt_s
         if dt_s is None:
-            t_s = self._clock_column(source, n, periods)
+            t_s = self._clock_column(n)
             if t_s is not None:
                 return t_s, nominal_dt(source, t_s)
             dt_s = self._stated_dt() or self._format_dt()
@@ -410,7 +406,7 @@ class _Reading:
             )
         return np.arange(n, dtype=np.float64) * dt_s, float(dt_s)
 
-    def _clock_column(self, source: str, n: int, periods: list[int]) -> FloatArray | None:
+    def _clock_column(self, n: int) -> FloatArray | None:
         """The time column (n,), s, of one of the files; all that there are must agree."""
         found: list[tuple[str, FloatArray]] = []
         if "t" in self.by_quantity:
@@ -436,15 +432,13 @@ class _Reading:
                     f"{whole[0][0]}: resample one of them; or if the samples belong together, say whose time is right "
                     "with --file t=FILE"
                 )
-        if whole:
-            return whole[0][1]
-        where, t_s = found[0]
-        if len(t_s) not in periods:
-            raise InputError(f"{where}: t_s: got {len(t_s)} samples, expected {n} as u_V and y_um")
-        dt_s = nominal_dt(where, t_s)
-        sample = np.arange(n)
-        self.notes.append(f"time: continued by {len(t_s) * dt_s:.6g} s with every period")
-        return np.asarray(t_s[sample % len(t_s)] + (sample // len(t_s)) * (len(t_s) * dt_s))
+        if not whole:
+            where, t_s = found[0]
+            raise InputError(
+                f"{where}: t_s: got {len(t_s)} samples, expected {n} as u_V and y_um; of one period, give the rate as "
+                "--rate HZ"
+            )
+        return whole[0][1]
 
     def _time_name(self, table: Table) -> str | None:
         """The array of the time in a table, if it has one."""
@@ -487,7 +481,7 @@ class _Reading:
         starts: list[tuple[str, float]] = []
         for quantity, name in self.names.items():
             table = self.by_quantity.get(quantity, self.main)
-            dt_s, start_s = table.clocks.get(name, (table.dt_s, None))
+            dt_s, start_s = table.clocks.get(name, (None, None))
             if dt_s is not None:
                 found.append((f"{name} of {table.source}", dt_s))
             if start_s is not None and quantity not in self.mapping.repeat:
@@ -500,7 +494,7 @@ class _Reading:
                     f"{where}: starts {round(start_s - starts[0][1], 6):+g} s after {starts[0][0]}, expected the same "
                     "start: cut them to the same times; or if the samples belong together, add --dt-s SECONDS"
                 )
-        if dt_s is not None and self.main.dt_s is None:
+        if dt_s is not None:
             self.notes.append(f"sample time {dt_s:g} s as the file states it")
         return dt_s
 

@@ -26,7 +26,6 @@ class Table:
     ----------
     source : the file, for messages.
     arrays : name -> array of any shape and type.
-    dt_s : sample time of all arrays, s, where the format defines one.
     notes : remarks of the reader, for people.
     units : name -> unit, where the file states it apart from the name.
     clocks : name -> (sample time, start), s, where the file has them for each array; None for an unknown start.
@@ -36,7 +35,6 @@ class Table:
 
     source: str
     arrays: dict[str, NDArray[Any]]
-    dt_s: float | None = None
     notes: tuple[str, ...] = field(default=())
     units: dict[str, str] = field(default_factory=dict)
     clocks: dict[str, tuple[float, float | None]] = field(default_factory=dict)

@@ -64,7 +64,7 @@ def opened(path: Path, encoding: str) -> TextIO:
 
 
 def encoding_of(path: Path, head: bytes) -> str:
-    """The encoding of a text by its beginning: UTF-8 or UTF-16 with or without a mark, else Latin-1.
+    """The encoding of a text by its beginning: UTF-8, UTF-16 with its mark, else Latin-1.
 
     Latin-1 has the µ and ° of old controllers. Raises InputError where it is no text.
     """
@@ -75,13 +75,7 @@ def encoding_of(path: Path, head: bytes) -> str:
     ):
         if head.startswith(mark):
             return name
-    zeros = [head[k:4096:2].count(0) for k in (0, 1)]
-    if any(zeros):
-        # Every second byte of plain letters in UTF-16 is zero.
-        half = min(len(head), 4096) // 2
-        for name, (many, few) in (("utf-16-le", (zeros[1], zeros[0])), ("utf-16-be", (zeros[0], zeros[1]))):
-            if few == 0 and many > 0.9 * half:
-                return name
+    if 0 in head:
         raise InputError(f"{path}: is not text, expected text, .parquet, .mat, .h5, .npy, .npz, .tdms or .xlsx")
     try:
         # A letter may be cut in two at the end.

@@ -1,4 +1,4 @@
-"""Feedforward, feedback and both on a simulated stage, and the Ziegler-Nichols gains of a stage.
+"""Feedforward, feedback and both on a simulated stage, and its Ziegler-Nichols gains.
 
 The controller reads ``y(t_k)``, computes ``u_k`` from the error at ``t_k`` and applies it until ``t_(k+1)``. Nothing of
 a sample is used before it could be known.
@@ -7,15 +7,16 @@ a sample is used before it could be known.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from dehyst.adaptive.errors import InputError, NumericsError
-from dehyst.adaptive.types import FloatArray, InverseModel
+from dehyst.adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from dehyst.sim.signals.references import Reference
-from dehyst.sim.stage.stage import Stage, StageState
+from dehyst.sim.stage.stage import Stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +45,6 @@ class PID:
                 raise InputError(f"{name}: got {value!r}, expected a finite gain from 0 on")
         if not (math.isfinite(self.dt_s) and self.dt_s > 0.0):
             raise InputError(f"dt_s: got {self.dt_s!r}, expected a sample time above 0 s")
-
-    def initial_state(self) -> PIDState:
-        """State before the first error."""
-        return PIDState()
 
     def step(self, state: PIDState, error_um: float) -> float:
         """Feedback voltage u_FB(k), V; advances ``state``."""
@@ -82,8 +79,6 @@ class Run:
     reference_um: FloatArray
     y_um: FloatArray
     u_V: FloatArray
-    feedforward_V: FloatArray
-    feedback_V: FloatArray
 
     @property
     def error_um(self) -> FloatArray:
@@ -91,57 +86,72 @@ class Run:
         return self.reference_um - self.y_um
 
 
+@dataclass(frozen=True, slots=True)
+class BlockConfig:
+    """block : samples answered at once, >= 1. delay_blocks : age of the answering snapshot, blocks, >= 1.
+
+    Raises InputError on smaller values.
+    """
+
+    block: int = 20
+    delay_blocks: int = 3
+
+    def __post_init__(self) -> None:
+        if self.block < 1 or self.delay_blocks < 1:
+            raise InputError(f"block, delay_blocks: got {self.block}, {self.delay_blocks}, expected at least 1 each")
+
+
 def track(
     stage: Stage,
     reference: Reference,
     *,
     model: InverseModel | None = None,
+    online: OnlineModel | None = None,
     pid: PID | None = None,
-    state: StageState | None = None,
-    memory: FloatArray | None = None,
-    u2_V: FloatArray | None = None,
+    config: BlockConfig | None = None,
 ) -> Run:
-    """Follow a reference with feedforward (``model``), feedback (``pid``) or both.
+    """Follow a reference from rest with feedforward (``model`` or ``online``), feedback (``pid``), or both.
 
-    The feedforward is computed for the whole reference at once, because it depends on the reference alone. ``state``
-    and ``memory`` continue an earlier run (``state`` is advanced); by default stage and model start at rest at 0 µm.
+    ``online`` learns and is advanced: block by block, a snapshot that has seen no sample of the last ``delay_blocks``
+    blocks gives the voltages of the next one, whose samples then teach it. That is what the service does. The
+    feedforward of ``model`` depends on the reference alone and is one block.
     Where limits clamp the voltage, the feedback is set back by the clamped part, so that it does not wind up. Raises
     InputError where sample times differ, or neither model nor gains are given.
     """
-    dt_s = stage.config.dt_s
-    if model is None and pid is None:
+    config, dt_s, n = config or BlockConfig(), stage.config.dt_s, reference.y_um.size
+    first = model if online is None else online.snapshot()
+    if first is None and pid is None:
         raise InputError("model, pid: got neither, expected a feedforward model, feedback gains or both")
-    for name, other in (("model", model), ("pid", pid)):
+    for name, other in (("model", first), ("pid", pid)):
         if other is not None and not math.isclose(other.dt_s, dt_s, rel_tol=1e-9):
             raise InputError(f"{name}: got a sample time of {other.dt_s} s, expected that of the stage, {dt_s} s")
-    if state is None:
-        state = stage.initial_state()
-    n = reference.y_um.size
-    forward = np.zeros(n)
-    if model is not None:
-        start = model.rest_memory(0.0) if memory is None else memory
-        forward = np.asarray(
-            model.feedforward(reference.y_um, reference.v_um_per_s, reference.a_um_per_s2, start).u_V, dtype=np.float64
-        )
+    state, fed = stage.initial_state(), PIDState()
     low, high = stage.config.u_min_V, stage.config.u_max_V
-    u = np.clip(forward, low, high)
-    first = state.k
-    if pid is None:
-        y, _ = stage.run(state, u, u2_V)
-        feedback = np.zeros(n)
-    else:
-        y, feedback = np.empty(n), np.empty(n)
-        memory_pid = pid.initial_state()
-        for k in range(n):
-            reading = stage.read(state)[0]
-            back = pid.step(memory_pid, float(reference.y_um[k]) - reading)
-            wanted = float(forward[k]) + back
-            applied = min(max(wanted, low), high)
-            memory_pid.limit(wanted, applied)
-            stage.step(state, applied, 0.0 if u2_V is None else float(u2_V[k]))
-            y[k], u[k], feedback[k] = reading, applied, back
-    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
-    return Run(t_s, reference.y_um, y, u, forward, feedback)
+    y, u, forward = np.empty(n), np.empty(n), np.zeros(n)
+    snapshots = deque([first], maxlen=config.delay_blocks)
+    memory = None if first is None else first.rest_memory(0.0)
+    block = n if online is None else config.block
+    for start in range(0, n, block):
+        part = slice(start, min(n, start + block))
+        if snapshots[0] is not None and memory is not None:
+            motion = reference.y_um[part], reference.v_um_per_s[part], reference.a_um_per_s2[part]
+            answer = snapshots[0].feedforward(*motion, memory)
+            forward[part], memory = answer.u_V, answer.memory
+        if pid is None:
+            u[part] = np.clip(forward[part], low, high)
+            y[part], _ = stage.run(state, u[part])
+        else:
+            for k in range(part.start, part.stop):
+                y[k] = stage.read(state)[0]
+                wanted = float(forward[k]) + pid.step(fed, float(reference.y_um[k]) - y[k])
+                u[k] = min(max(wanted, low), high)
+                fed.limit(wanted, float(u[k]))
+                stage.step(state, float(u[k]))
+        if online is not None:
+            for k in range(part.start, part.stop):
+                online.handle(Sample(k, k * dt_s, float(u[k]), float(y[k])))
+            snapshots.append(online.snapshot())
+    return Run(np.arange(n, dtype=np.float64) * dt_s, reference.y_um, y, u)
 
 
 @dataclass(frozen=True, slots=True)

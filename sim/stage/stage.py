@@ -66,7 +66,6 @@ class Trace:
     y_um: FloatArray
     y2_um: FloatArray
     true_um: FloatArray
-    true2_um: FloatArray
     drive_V: FloatArray
 
 
@@ -185,7 +184,7 @@ class Stage:
             drive[done:end] = volts[0]
             done = end
         t_s = np.arange(first, first + n) * self.config.dt_s
-        return Trace(t_s, y[0, :n], y[1, :n], true[0, :n], true[1, :n], drive)
+        return Trace(t_s, y[0, :n], y[1, :n], true[0, :n], drive)
 
     def _commands(self, u_V: FloatArray, u2_V: FloatArray | None) -> FloatArray:
         u = np.asarray(u_V, dtype=np.float64)

@@ -71,14 +71,13 @@ BASE = {name: case(1.0) for name in NAMES}
 REPEATED = [{name: case(1.1 if (i + k) % 2 else 1 / 1.1) for i, name in enumerate(NAMES)} for k in range(2)]
 
 
-def rows(variant: dict[str, Numbers], comparisons: int = 1000, sign: int = 1) -> list[str]:
-    return [str(row) for row in worse_rows(variant, BASE, REPEATED, {"sensor": NAMES}, comparisons, sign)]
+def rows(variant: dict[str, Numbers], comparisons: int = 1000) -> list[str]:
+    return [str(row) for row in worse_rows(variant, BASE, REPEATED, {"sensor": NAMES}, comparisons)]
 
 
 def test_a_row_is_worse_where_its_cases_grow_by_more_than_other_noise_does() -> None:
     grown = {name: case(1.0, worst=1.5) for name in NAMES}
     assert rows(grown) == ["sensor worst × 1.48"]
-    assert rows(grown, sign=-1) == []
     # As much in one case only, or as other noise does, or equal.
     assert rows(BASE | {"c0": case(1.0, worst=100.0)}) == []
     assert rows(REPEATED[0]) == []

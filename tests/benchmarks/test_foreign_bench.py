@@ -42,8 +42,8 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
         run("none", settled_pct=0.01),
         run("knock", worst_ratio=0.9, settled_pct=0.03),
         run("knock", worst_ratio=1.3, large_s=0.2, settled_pct=0.05),
-        run("gain_at_once", first_second_pct=0.2, event={"size": -0.03}, settled_pct=0.02, believed_samples=14),
-        run("gain_at_once", first_second_pct=0.6, event={"size": 0.12}, settled_pct=0.04, believed_samples=18),
+        run("gain_at_once", first_second_pct=0.2, event={"size": -0.03}, settled_pct=0.02),
+        run("gain_at_once", first_second_pct=0.6, event={"size": 0.12}, settled_pct=0.04),
         run("zero_at_once", ends_at_rail=True, settled_pct=9.0, troubles=[{"name": "rail"}], false_troubles=["rail"]),
         run("sign", sensor_excess=0.5, sensor_ratio=1.2, named_s=0.4),
         run("stuck_noise", sensor_excess=1.5, sensor_ratio=1.8, named_s=0.1),
@@ -52,7 +52,7 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
         FAILED,
     ]
     told_goals = goals(records)
-    intact, sensors, ratio, knock, step, believed, wrong, settled, false = last_cells(told_goals)
+    intact, sensors, ratio, knock, step, wrong, settled, false = last_cells(told_goals)
     assert intact == "2 of 6"
     assert wrong == "not measured by these runs"
     assert sensors == "3 of 4; 2 of 4; 1 of 4"
@@ -60,7 +60,6 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
     assert knock == "1.10 / 1.30"
     # 0.2 % after 3 % and 0.6 % after 12 % are 0.4 and 0.3 % after 6 %.
     assert step == "0.350 / 0.395 % (0.400 / 0.580 %)"
-    assert believed == "16 / 18"
     assert settled.startswith("0.035 %")
     assert false == "1 in 1.00 h of simulated time"
     assert "2 runs of 3 to 12 %" in told_goals
@@ -124,6 +123,18 @@ def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
         "simulated_s": 1800.0, "mean_pct": 0.05, "figures": {"large_s": 0.0}, "troubles": [], "cpu_s": 1.0,
     }  # fmt: skip
     return record | given
+
+
+def test_healthy_runs_are_counted_and_each_that_is_not_well_is_told() -> None:
+    trouble = [{"name": "sensor_frozen", "named_s": 7.0}]
+    said = foreign.healthy_table(
+        [healthy_run(1), healthy_run(2, troubles=trouble, mean_pct=0.15), {"seed": 3, "block": 5, "failed": "E: no"}]
+    ).splitlines()
+    assert said[0].startswith("healthy: 3 stages, 1 failed, 1.00 h; false troubles 1 (sensor_frozen 1); 0 above 5 %")
+    assert "median / 95 %: 0.100 / 0.145" in said[0]
+    assert "TROUBLE sensor_frozen at 7.00 s" in said[1]
+    assert said[2].startswith("seed 3")
+    assert len(said) == 3
 
 
 def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

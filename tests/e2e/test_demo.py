@@ -15,8 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from dehyst.lab.cli import main
-from dehyst.sim.stage.file import save_stage
-from dehyst.sim.stage.presets import preset
 
 MODELS = {"linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive"}
 DURATION_S = 12.0
@@ -147,9 +145,8 @@ def test_no_voltage_is_late_beside_busy_processes_and_the_end_says_what_that_too
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.alone
-def test_strict_keeps_real_time_with_a_stage_of_a_file_and_counts_what_is_late(tmp_path: Path) -> None:
-    save_stage(preset("rich", seed=20), tmp_path / "stage.toml")
-    done = demo(tmp_path / "strict", "--strict", "--stage", str(tmp_path / "stage.toml"))
+def test_strict_keeps_real_time_and_counts_what_is_late(tmp_path: Path) -> None:
+    done = demo(tmp_path / "strict", "--strict")
     assert done.returncode == 0, done.stderr
     found = summary(tmp_path / "strict")
     assert found["pace"]["waited_s"] == 0.0

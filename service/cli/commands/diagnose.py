@@ -1,7 +1,7 @@
 """``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain.
 
 Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), and DIR/stage.toml, the
-extended stage that `dehyst stage --file` and `dehyst demo --stage` run.
+extended stage that `dehyst stage --file` and `dehyst rehearse --plant` run.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
 
   dehyst diagnose recording.csv --out out/diagnosis

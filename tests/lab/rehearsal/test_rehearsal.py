@@ -248,7 +248,6 @@ def course(error_um: np.ndarray, u_V: np.ndarray, trouble: np.ndarray | None = N
         said,
         ("", "sensor_frozen"),
         np.zeros(n, dtype=np.int64),
-        (),
     )
 
 
@@ -266,13 +265,13 @@ def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
     one = result.adaptive
     assert (one.before_pct, one.first_second_pct, one.then_pct) == pytest.approx((0.1, 6.0, 2.0))
     assert (one.settled_pct, one.worst_half_second_pct) == pytest.approx((1.1, 6.0))
-    assert (one.large_s, one.large_at_s, one.rail_s) == pytest.approx((1.0, 0.0, 0.2))
+    assert (one.large_s, one.large_at_s) == pytest.approx((1.0, 0.0))
     assert not one.ends_at_rail
     assert result.worst_ratio == pytest.approx(2.0)
     error[8000:] = 20.0  # at the limit, and still not there: no voltage does better
     result = outcome(event, course(error, u_V), course(error, quiet), None, 100.0, limits, DT_S, "")
     assert not result.adaptive.ends_at_rail
-    assert (result.adaptive.large_s, result.adaptive.rail_s) == pytest.approx((1.0, 0.2))
+    assert result.adaptive.large_s == pytest.approx(1.0)
     error[8000:] = -20.0
     result = outcome(event, course(error, u_V), course(error, quiet), None, 100.0, limits, DT_S, "")
     assert result.adaptive.ends_at_rail

@@ -16,6 +16,8 @@ from dehyst.lab.cli import main
 from dehyst.lab.commands.rehearse import failed
 from dehyst.lab.rehearsal.rehearsal import remarks
 from dehyst.service.cli.python_file import load_object
+from dehyst.sim.stage.file import save_stage
+from dehyst.sim.stage.presets import preset
 
 ROOT = Path(__file__).resolve().parents[3]
 #: Rate-dependent in nothing, and fast: two plays in a line, a sample late.
@@ -55,6 +57,18 @@ def plant(tmp_path: Path) -> Path:
     path = tmp_path / "mine.py"
     path.write_text(PLANT)
     return path
+
+
+def test_a_stage_file_is_a_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "stage.toml"
+    save_stage(preset("bouc_wen", changes=((0.1, {"mechanics.payload_kg": 1.0}),)), path)
+    options = ["--events", "none", "--settle", "2", "--after", "4", "--no-pictures", "--quiet", "--json"]
+    assert main(["rehearse", "--plant", str(path), "--out", str(tmp_path / "out"), *options]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["u_min_V"], found["u_max_V"], found["dt_s"]) == (-2.0, 10.0, 0.001)
+    assert found["runs"][0]["adaptive"]["settled_pct"] < 0.1
+    assert main(["rehearse", "--plant", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out"), *options]) == 2
+    assert "expected a stage file" in capsys.readouterr().err
 
 
 WATCHED = """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.commands.soak import seconds
+from dehyst.lab.soak.controller import ControlTask
 from dehyst.lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
 from dehyst.lab.soak.observed import Intervals
 from dehyst.service.stage_node.faults import decode_fault
@@ -79,3 +82,15 @@ def test_intervals_are_a_set_of_integers(parts: list[tuple[int, int]], others: s
 def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
     with pytest.raises(InputError, match=f"^{named}: got"):
         decode_fault(payload)
+
+
+@pytest.mark.parametrize(
+    ("u_V", "before_V", "allowed"),
+    [
+        ([1.0, 2.0], 0.0, True), ([1.0, 2.0], math.nan, True), ([2.0, 3.0], 0.0, False), ([1.0, 3.0], 0.0, False),
+        ([-0.1], 0.0, False), ([10.0, 10.1], 10.0, False), ([1.0, math.nan], 0.0, False), ([math.inf], 10.0, False),
+    ],
+)  # fmt: skip
+def test_an_answer_keeps_limits_slew_and_numbers(u_V: list[float], before_V: float, allowed: bool) -> None:
+    task = ControlTask(1e-3, 4.0, 80.0, 1, u_min_V=0.0, u_max_V=10.0, slew_V_per_s=1000.0)
+    assert task.allows(np.array(u_V), before_V) is allowed

@@ -13,20 +13,17 @@ from dehyst.baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from dehyst.baselines.common import Domain
 from dehyst.sim.chapter import published
 from dehyst.sim.chapter.control import (
-    BlockConfig,
-    chapter_reference,
+    control_references,
     learner_of,
     replay,
     run_control,
-    sine_reference,
-    track_learning,
-    training_reference,
 )
 from dehyst.sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments
 from dehyst.sim.chapter.forward_lssvm import fit_two_inputs
 from dehyst.sim.chapter.modelling import identify_forward, refine_bouc_wen
+from dehyst.sim.signals.references import demo_reference
 from dehyst.sim.signals.voltages import training_input
-from dehyst.sim.stage.closed_loop import track
+from dehyst.sim.stage.closed_loop import BlockConfig, track
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 
@@ -134,27 +131,27 @@ def inverse() -> BoucWenInverse:
     return BoucWenInverse(TABLE_2_1, DT_S, Domain(0.0, 90.0, 2000.0))
 
 
-@pytest.mark.parametrize("make", [chapter_reference, training_reference, sine_reference])
-def test_references_are_their_own_derivatives(make: object) -> None:
-    reference = make(80.0)  # type: ignore[operator]
+@pytest.mark.parametrize("name", ["sine 5 Hz", "tones, minor loops, holds"])
+def test_references_are_their_own_derivatives(name: str, rich: Experiments) -> None:
+    reference = control_references(rich)[name]
     inner = slice(2, -2)
     v = np.gradient(reference.y_um, DT_S)[inner]
     a = np.gradient(reference.v_um_per_s, DT_S)[inner]
     assert np.max(np.abs(v - reference.v_um_per_s[inner])) < 2e-3 * np.max(np.abs(v))
     assert np.max(np.abs(a - reference.a_um_per_s2[inner])) < 5e-3 * np.max(np.abs(a))
     assert reference.y_um.min() >= -1e-9
-    assert reference.y_um.max() < 80.0
+    assert reference.y_um.max() <= 0.9 * rich.range_um
     assert abs(reference.y_um[0]) < 1e-2
 
 
 def test_blocks_of_a_model_that_does_not_learn_equal_one_run() -> None:
     """A learner that is never due to learn serves its base: blocks and carried memory must not change a voltage."""
-    stage, reference = Stage(preset("bouc_wen")), sine_reference(70.0, duration_s=1.0)
+    stage, reference = Stage(preset("bouc_wen")), demo_reference(2.0, DT_S, (0.0, 70.0))
     model = inverse()
     from dehyst.baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 
     online = BoucWenOnline(model, TrackingConfig(learn_every=10**6))
-    blocks = track_learning(stage, reference, online, config=BlockConfig(block=7, delay_blocks=2))
+    blocks = track(stage, reference, online=online, config=BlockConfig(block=7, delay_blocks=2))
     whole = track(stage, reference, model=online.snapshot())
     np.testing.assert_allclose(blocks.u_V, whole.u_V, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(blocks.y_um, whole.y_um)

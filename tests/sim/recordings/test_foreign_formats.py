@@ -258,7 +258,9 @@ def test_periods_in_an_array_are_put_one_after_another(tmp_path: Path) -> None:
 
 def test_one_period_of_the_drive_beside_many_of_readings(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t_s=T[:60], u_V=U[:60], y_um=Y[:200])
-    recording = read(tmp_path / "a.npz", ColumnMap(repeat=("u",)))
+    with pytest.raises(InputError, match=r"t_s: got 60 samples, expected 200 .*--rate HZ"):
+        read(tmp_path / "a.npz", ColumnMap(repeat=("u",)))
+    recording = read(tmp_path / "a.npz", ColumnMap(repeat=("u",), dt_s=DT_S))
     np.testing.assert_array_equal(recording.u_V, np.concatenate([U[:60]] * 4)[:200])
     np.testing.assert_array_equal(recording.y_um, Y[:200])
     np.testing.assert_allclose(recording.t_s, np.arange(200) * DT_S, atol=1e-12)

@@ -10,7 +10,7 @@ import pytest
 from dehyst.adaptive.errors import NumericsError
 from dehyst.sim.effects import Chain, effect
 from dehyst.sim.signals.references import demo_reference
-from dehyst.sim.stage.closed_loop import PID, track, ultimate_gain
+from dehyst.sim.stage.closed_loop import PID, PIDState, track, ultimate_gain
 from dehyst.sim.stage.config import StageConfig
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
@@ -20,7 +20,7 @@ DT = 1e-3
 
 def test_pid_is_the_increment_of_the_chapter() -> None:
     pid = PID(k_p=0.1, k_i=20.0, k_d=1e-4)
-    state = pid.initial_state()
+    state = PIDState()
     errors = [0.3, -0.2, 0.5, 0.1]
     outputs = [pid.step(state, e) for e in errors]
     e = np.array([0.0, 0.0, *errors])
@@ -29,7 +29,7 @@ def test_pid_is_the_increment_of_the_chapter() -> None:
     # a constant error integrates at the continuous gain, whatever the sample time
     for dt in (1e-3, 1e-4):
         p = PID(k_p=0.0, k_i=20.0, dt_s=dt)
-        s = p.initial_state()
+        s = PIDState()
         for _ in range(round(0.5 / dt)):
             p.step(s, 0.1)
         assert s.u_V == pytest.approx(20.0 * 0.1 * 0.5)
