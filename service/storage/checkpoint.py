@@ -144,8 +144,7 @@ class CheckpointFolder:
     def pin(self, now_s: float, long_s: float) -> None:
         """Keep all that are kept at ``now_s`` (``time.monotonic``) for ``long_s`` more; a full disk still takes them.
 
-        One that is there only because it was pinned before is not pinned again: who lists them all the time must not
-        keep them all.
+        One that is kept only by an earlier pin is not pinned again: frequent listing must not keep them all.
         """
         numbers = self.numbers()
         kept = self._regular(max(numbers, default=0), numbers)
@@ -153,7 +152,7 @@ class CheckpointFolder:
         self._pinned = pinned | dict.fromkeys(kept, now_s + long_s)
 
     def is_safe(self, number: int, now_s: float, long_s: float) -> bool:
-        """Whether a checkpoint stays for ``long_s`` more at least, but for a full disk."""
+        """Whether a checkpoint stays for at least ``long_s`` more, unless the disk is full."""
         return self._pinned.get(number, 0.0) >= now_s + long_s
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
@@ -236,7 +235,7 @@ class CheckpointFolder:
         for path in self._paths():
             if number_of(path) not in keep:
                 path.unlink(missing_ok=True)
-        for part in self.directory.glob("*checkpoint-*part"):  # of a process that was killed while it wrote
+        for part in self.directory.glob("*checkpoint-*part"):  # left by a process that was killed while it wrote
             part.unlink(missing_ok=True)
 
 
