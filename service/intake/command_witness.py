@@ -1,11 +1,11 @@
-"""The second witness of a sample: the voltage that was commanded for it.
+"""Compares the voltage of each sample with the one that was commanded for it.
 
-A controller that asks for the next voltages names what is under way: the voltages that it has commanded, and the motion
+A controller that asks for the next voltages sends what is under way: the voltages that it has commanded, and the motion
 that they are for, by the numbers of the samples (`service.protocol.query.Pending`). A sample with such a number has to
 show that voltage. Where many in a row do not, the columns are exchanged, scaled or late, or the samples are those of
-another stage. Then what was commanded is the better witness of both voltage and place, from the first such sample on:
-a place of another stage would otherwise stay in the memory of the hysteresis. Only a sample that shows the voltage of
-the one before is believed until the difference is named: a stage that missed a command holds its voltage.
+another stage. Commanded voltage and place then replace those of the samples, from the first such sample on: a place of
+another stage would otherwise stay in the memory of the hysteresis. Until the difference is named, only a sample that
+shows the voltage of the one before is believed: a stage that missed a command holds its voltage.
 """
 
 from __future__ import annotations
