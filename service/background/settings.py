@@ -14,17 +14,18 @@ class WatchConfig:
 
     Attributes
     ----------
-    enabled : false: no diagnosis.
+    enabled : false: no samples are kept, no process is started.
     history_s : time of the samples kept; those before the recent ones settle the hysteresis memory.
-    reference_s : time of the reference, taken after the start and each verdict.
+    reference_s : time of the reference, which is taken after the start and after each verdict.
     recent_s : time of the samples diagnosed on request.
-    collect_s : time of the samples diagnosed after an alarm.
-    gain_alarm : alarm at this relative change of the gain since the reference.
+    collect_s : time of the samples collected after an alarm and then diagnosed.
+    gain_alarm : relative change of the gain since the reference that raises an alarm.
     offset_alarm : the same of the offset, share of the voltage span.
-    error_factor, error_floor_pct : alarm at this recent rms error: multiple of the reference's, % of the voltage span.
-    hold_s : time that a condition must last for an alarm.
+    error_factor, error_floor_pct : recent rms error that raises an alarm: multiple of that in the reference, and
+        percentage of the voltage span.
+    hold_s : time for which a condition must last to raise an alarm.
     cooldown_s : least time between two alarms.
-    timeout_s : longest time of a diagnosis.
+    timeout_s : longest time of a diagnosis; then its process is killed.
     reports : folder for full reports on request (``"report": true``); empty for none.
     """
 
@@ -74,10 +75,10 @@ class RetuningConfig:
     Attributes
     ----------
     enabled : false: no re-tuning, also on request.
-    period_s : time of samples between two re-tunings; 0: only on request.
+    period_s : time of samples from the end of a re-tuning to the next; 0: only on request.
     fresh : new samples of the window that a proposal is tried on.
-    wait_s : longest time of samples to wait for these.
-    lead_s : time of samples from announcement to adoption, at one sample in a standby too.
+    wait_s : longest time of samples to wait for these; then the proposal is dropped.
+    lead_s : time of samples from announcement to adoption, so that a standby adopts at the same one.
     timeout_s : longest time of the process.
     search : range of the search and the criterion of a better model; see ``adaptive.tuning.config``.
     """

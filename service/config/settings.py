@@ -51,23 +51,29 @@ class AxisConfig:
         ),
     ]
     limits: Annotated[Limits, _LIMITS]
-    served: Annotated[str, Setting(help='default model of queries; "auto": the best of those that learn')] = AUTO
+    served: Annotated[
+        str, Setting(help='model that answers a query that names none; "auto": the best of those that learn')
+    ] = AUTO
     learn: Annotated[str, Setting(help='model that learns; "" for none')] = LEARN
-    compete: Annotated[tuple[str, ...], Setting(help='models that learn beside it, for "auto"; [] for none')] = COMPETE
+    compete: Annotated[
+        tuple[str, ...], Setting(help='models that learn beside it; "auto" serves the best of all; [] for none')
+    ] = COMPETE
     snapshot_every: Annotated[
         int, Setting(help="samples between two snapshots, which answer the queries", low=1, high=100_000)
     ] = 20
     snapshots_kept: Annotated[int, Setting(help="snapshots that a query can ask for by as_of", low=1, high=4096)] = 256
-    query_points: Annotated[int, Setting(help="most points of one query", low=1, high=MAX_COUNT)] = MAX_COUNT
+    query_points: Annotated[
+        int, Setting(help="most points of one query; a query for more is refused", low=1, high=MAX_COUNT)
+    ] = MAX_COUNT
     queue_samples: Annotated[
-        int, Setting(help="samples that may wait; more are counted and dropped", low=1, high=10_000_000)
+        int, Setting(help="samples that may wait for the learner; more are counted and dropped", low=1, high=10_000_000)
     ] = 20_000
     model_hz: Annotated[
         float, Setting(help="highest rate at which the model is published", unit="1/s", low=0, above=True, high=1000)
     ] = 50.0
     delta_hz: Annotated[
         float,
-        Setting(help="the same of its changes; 0: none", unit="1/s", low=0, high=1000),
+        Setting(help="highest rate at which changes of the model are published; 0: none", unit="1/s", low=0, high=1000),
     ] = 200.0
     recorder: Annotated[Path | None, Setting(help="folder for recordings", example="recordings/x")] = None
     recorder_bytes: Annotated[
@@ -77,7 +83,7 @@ class AxisConfig:
     checkpoints: Annotated[
         Path | None,
         Setting(
-            help="folder for the learner's state, for restarts",
+            help="folder for the learner's state, which a restart continues",
             example="checkpoints/x",
         ),
     ] = None
@@ -89,7 +95,7 @@ class AxisConfig:
     ] = 32
     stand_in: Annotated[
         str,
-        Setting(help="baseline that answers where the model is not trusted; default: the best", example="mpi"),
+        Setting(help="baseline that answers where the model cannot be trusted; default: the best one", example="mpi"),
     ] = ""
     blend_share: Annotated[
         float,
@@ -158,12 +164,12 @@ class ServeConfig:
         ),
     ] = None
     open: Annotated[
-        bool, Setting(help="true: no key, nothing is signed, everybody on the wire is believed (--open)")
+        bool, Setting(help="true: no key; nothing is signed, and everybody on the wire is believed (--open)")
     ] = False
     busy_after_s: Annotated[
         float,
         Setting(
-            help="a query of over 128 points that would take longer is refused as busy",
+            help="a query for more than 128 points that would take longer than this is refused as busy",
             unit="s",
             low=0.01,
             high=60,
