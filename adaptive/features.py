@@ -15,7 +15,7 @@ Two vectors come out of a point:
 - ``kernel`` (d,): inputs of its kernel part, ``[y, v, (y - play_r)/r for the chosen r]``.
 
 All operators and inputs see the displacement in the *frame* of the identified stage, (y - offset)/gain: a stage
-whose gain has dropped goes through the same states at other readings, and the drop is no motion for its memory.
+whose gain has dropped passes the same states at other readings, and its memory does not see the drop as motion.
 
 The chapter's two-input model is the special case without memory: basis ``[1]``, kernel ``[y, v]``.
 """
@@ -141,7 +141,7 @@ def _run_features(
 class FeatureMap:
     """Frozen map from motion to model inputs.
 
-    The frame: a reading y stands for the displacement (y - offset_um)/gain of the identified stage.
+    The frame: a reading y means the displacement (y - offset_um)/gain of the identified stage.
     """
 
     dt_s: Annotated[float, Entry("sample time", "s")]

@@ -282,7 +282,7 @@ def identify_lssvm(
         raise InputError(f"inputs: got {inputs!r}, expected 'two' or 'memory'")
     memory, taught = inputs == "memory", u
     if memory:
-        # The voltage is smoothed alike: what the smoother takes from the motion must not be looked for in it.
+        # The voltage is smoothed in the same way: it must not keep what the smoother takes from the motion.
         smoother = SmootherConfig.for_rate(dt_s, config.cutoff_hz)
         motion, taught = smooth_recording(y, smoother), np.ascontiguousarray(smooth_recording(u, smoother)[:, 0])
     else:

@@ -320,7 +320,7 @@ class LssvmInverse(Kinded):
     ) -> tuple[float, float, bool]:
         """``feedforward`` of one point, (voltage, deviation, inside), without its checks: three floats and no others.
 
-        ``memory`` (m,), contiguous doubles, is advanced in place. For who asks point by point at a controller's rate.
+        ``memory`` (m,), contiguous doubles, is advanced in place. For callers that ask point by point.
         """
         u_V, std_V, inside = evaluate_point(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts)
         return u_V, std_V, inside

@@ -1,4 +1,4 @@
-"""Sizes that numpy's files declare, compared with the bytes that are there before numpy allocates by them."""
+"""Compare the sizes that numpy files declare with the bytes they have, before numpy allocates memory for them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.lib import format as npy
 def check_npy(stream: IO[bytes], size: int) -> None:
     """Raise ValueError where ``.npy`` data of ``size`` bytes declare more values than they have; reads the header.
 
-    An array of objects is left to numpy, which refuses it by ``allow_pickle=False``.
+    numpy itself refuses arrays of objects (``allow_pickle=False``).
     """
     read_header: Any = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read_header(stream)
@@ -31,7 +31,7 @@ def check_npz(archive: zipfile.ZipFile, most_bytes: int) -> None:
         raise ValueError(f"unpacks to {size} bytes, expected at most {most_bytes}")
     for entry in archive.infolist():
         with archive.open(entry) as member:
-            # Any member that begins like an array is one to numpy, whatever its name.
+            # numpy reads any member that begins like an array as one, whatever its name.
             if member.read(len(npy.MAGIC_PREFIX)) != npy.MAGIC_PREFIX:
                 continue
             member.seek(0)

@@ -1,4 +1,4 @@
-"""Records that nobody here made: the learner and the served axis beside frozen, baselines and simple regressions.
+"""Records of other authors: the learner and the served axis beside frozen model, baselines and simple regressions.
 
 ``python -m benchmarks.measured`` identifies each record of ``RECORDS`` on its first part and replays the rest. Every
 method predicts the voltage from the measured displacement at the same instants. The score is the RMSE in percent of the

@@ -1,8 +1,8 @@
 """Search for the hyper-parameters with the best evidence: level 2, (2.35), for gamma; level 3, (2.36), or the joint
 optimum for the kernel widths.
 
-The evidence has several optima, and its deepest one can be narrow: on a part of the samples it is not there at all. So
-the answer is checked against a coarse scan, whose widths go from the distance of neighbouring samples to their extent.
+The evidence has several optima, and a part of the samples may not show the deepest one. Therefore a coarse scan checks
+the answer; its widths go from the distance of neighbouring samples to their extent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dehyst.adaptive.lssvm import one_thread
 from dehyst.adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
 from dehyst.adaptive.types import FloatArray
 
-#: The chapter's start, first; the others because the evidence has several optima.
+#: The chapter's start comes first; the others are there because the evidence has several optima.
 STARTS: tuple[tuple[float, float], ...] = ((100.0, 1.0), (1e4, 0.4), (1e5, 2.5), (1e3, 6.0))
 
 

@@ -9,7 +9,7 @@ S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and 
 described in `adaptive.window.arrays`.
 
 Every function takes the arrays of the window and returns a `Status` as int, or a number. Nothing allocates and nothing
-raises. A step that would leave the finite numbers is refused, counted and taken back: samples, alpha and bias are then
+raises. A step with a result that is not finite is refused, counted and taken back: samples, alpha and bias are then
 what they were to the last bit, and so is the factor of the Cholesky form. P of the inverse form may have taken in the
 rank-2 term that was pending, so that it is the same up to rounding.
 """

@@ -6,7 +6,7 @@ new champion without a jump (`baselines.competition.champion`).
 
 The first contestant is the favourite, a learner. Its verdicts on samples are those of the competition: all are scored
 on the motion that it smooths, where it accepts that. It is the first champion, and becomes champion again as soon as it
-is no worse. Another contestant that raises leaves the competition; what the favourite raises, ``handle`` raises.
+is no worse. Another contestant that raises leaves the competition; ``handle`` raises what the favourite raises.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseMode
 #
 # A contestant is scored by the snapshot that callers had when the motion happened (``serving_age_s`` old), so the
 # scored samples have not taught it. Displacement, velocity, acceleration and voltage are those that the favourite has
-# smoothed. Only motion is scored that it accepts: what its judge refuses says nothing of a model, and every model
-# predicts a stage at rest.
+# smoothed. Only motion that it accepts is scored: refused samples say nothing of a model, and every model predicts a
+# stage at rest.
 
 #: Verdicts of the favourite on samples that are scored.
 _SCORED: Final = frozenset({gates.LEARNT, gates.PASSED, gates.REDUNDANT, gates.OUTLIER, gates.FROZEN})
@@ -113,7 +113,7 @@ class _RunningError:
     def add_block(self, model: InverseModel, rows: FloatArray, share: float, worst_V: float) -> bool:
         """Score ``model`` on a block (5, n) whose mean gets the weight ``share``; False where an answer is not finite.
 
-        An error counts at most ``worst_V``, so that a single absurd answer is forgotten as soon as any other.
+        An error counts as at most ``worst_V``: one absurd answer is forgotten as fast as any other.
         """
         forward = model.feedforward(rows[0], rows[1], rows[2], self.memory)
         if np.isfinite(forward.memory).all():
@@ -344,7 +344,7 @@ class Competition:
     ) -> Competition:
         """``learner``, started from ``model``, against the online forms of ``others``; those without one are left out.
 
-        Raises InputError unless ``model`` is an LSSVM, whose range errors are measured by.
+        Raises InputError unless ``model`` is an LSSVM: its range is the unit of the errors.
         """
         if not isinstance(model, LssvmInverse):
             raise InputError(f"{favourite}: got a {type(model).__name__}, expected an LSSVM model")
@@ -592,7 +592,7 @@ class Competition:
         for name, model in zip(self.names, self._models, strict=True):
             with part_of(rest, f"model.{name}.") as kept:
                 models[name] = model.restored(kept)
-        with part_of(rest, "config."):  # compared by who restores
+        with part_of(rest, "config."):  # the caller compares them
             made = Competition(models, self._span_V, self.config)
         made.judge.restore(self.names, rest)
         given = {"_choice": {"config": self.config, "span_V": self._span_V}}

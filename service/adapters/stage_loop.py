@@ -30,11 +30,11 @@ class LoopSummary:
 
     Attributes
     ----------
-    samples : taken. late : sample times at which the loop was too late (`service.adapters.adapter.LATE_SHARE`): they
-        are no samples. worst_late_ms : largest lateness of a sample time, ms.
+    samples : taken. late : sample times at which the loop was too late (by a quarter of a sample time): they are no
+        samples. worst_late_ms : largest lateness of a sample time, ms.
     limited : voltages that were not finite, or changed by the limits of voltage or slew rate.
     published, lost : samples by the network.
-    missing : voltages that had not come in time, where they come over the network.
+    missing : voltages that the network had not brought in time.
     foreign : commands that were left out because another controller owns ``.../command``.
     """
 

@@ -53,7 +53,7 @@ class MemoryTracker:
         self.forget()
 
     def forget(self) -> None:
-        """Drop what waits, and begin the differences anew."""
+        """Drop the samples that wait, and begin the differences anew."""
         self._rows.clear()
         self._seq = -1
         self._y = math.nan
@@ -95,7 +95,7 @@ def derivatives(
 ) -> tuple[FloatArray, FloatArray]:
     """(v, a), each (n,), µm/s and µm/s², of ``y_um`` (n,) with points ``dt_s`` apart.
 
-    What is given is kept; what is not is taken by central differences, one-sided and of second order at the ends.
+    Given values are kept; missing ones are central differences, one-sided and of second order at the ends.
     A single point rests. Raises InputError on other lengths and on what is not finite.
     """
     n = y_um.size
@@ -184,7 +184,7 @@ def answer(
     age_s: float | None,
     pace: Pace | None = None,
 ) -> Trajectory:
-    """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
+    """Voltages for a query, safe to apply. Raises InputError on an invalid query.
 
     ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
     ``age_s``: time since the newest sample that was handled came, s, None before any. An ``as_of`` names its
@@ -266,7 +266,7 @@ def begin_from(model: InverseModel, memory: FloatArray, query: FeedforwardQuery,
     nearest to the commanded one, so that a turn of the motion there is not taken for a difference of the models.
     """
     pending, points = query.pending, (query.y_um, query.v_um_per_s, query.a_um_per_s2)
-    # What was commanded for samples before the last one seen is long done.
+    # Commands for samples before the last one seen have been applied already.
     if pending is None or pending.first + pending.y_um.size <= seq:
         return Beginning(memory, points)
     seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size - 1)
@@ -333,7 +333,7 @@ def learns(name: str, config: AxisConfig) -> bool:
 def blends(name: str, default: str, config: AxisConfig) -> bool:
     """Whether a model gives way to the stand-in outside its domain: the default and the one that learns do.
 
-    The others are asked by name to be compared, and answer as themselves.
+    Queries name the others to compare them, so they answer alone.
     """
     return name == default or learns(name, config)
 

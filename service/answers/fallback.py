@@ -1,4 +1,4 @@
-"""One answer, safe to apply: the model's own, blended with a stand-in where the model is not to be trusted.
+"""One answer, safe to apply: the model's own, blended with a stand-in where the model is not trusted.
 
 Everything here is a pure function of a snapshot and a query. The service answers by it, and so does a follower in
 its own process, so that both give the same voltages to the last bit.
@@ -43,7 +43,7 @@ class Rules(NamedTuple):
 
     Attributes
     ----------
-    limits : of what leaves. blend_share : distance from the learnt domain, as a share of the learnt span, at which the
+    limits : of the voltages. blend_share : distance from the learnt domain, as a share of the learnt span, at which the
     stand-in answers alone. trust : weight of the model inside its domain, 0 to 1. stale : flag every point STALE.
     """
 
@@ -80,7 +80,7 @@ def answer_safely(
     after_ok = all_finite(forward.memory)
     trusted = not blends or rules.trust >= 1.0
     if trusted and after_ok and not rules.stale:
-        # Almost every answer: nothing speaks against what the model says.
+        # Almost every answer: the model is trusted, inside its domain and finite.
         safe, flags, found = guarded(u, forward.inside, model.dt_s, rules.limits, u_before_V)
         if not found & (NOT_FINITE_REPLACED | (OUTSIDE_DOMAIN if blends else 0)):
             return Answer(safe, std, flags, forward.memory)
@@ -129,7 +129,7 @@ def _resumed(
 
 
 def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArray], memory: FloatArray) -> Feedforward:
-    """What the model says; NaN where it raises, which no model may."""
+    """The model's answer; NaN where it raises, which no model may."""
     try:
         return model.feedforward(*points, memory)
     except Exception as error:
@@ -138,7 +138,7 @@ def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArr
         return Feedforward(nothing, nothing, np.zeros(points[0].size, dtype=np.bool_), memory)
 
 
-@np.errstate(all="ignore")  # a memory out of this world gives voltages out of it, which are guarded later
+@np.errstate(all="ignore")  # an absurd memory gives absurd voltages, which the guard limits later
 def _mix(
     forward: Feedforward, weight: FloatArray, finite: NDArray[np.bool_], other: Feedforward
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
@@ -149,7 +149,7 @@ def _mix(
     own = np.where(finite, forward.u_V, 0.0)
     there = np.where(usable, other.u_V, 0.0)
     u = np.where(w == 1.0, forward.u_V, there + w * (own - there))
-    # Of a mixture of two: each one's own variance, and that of their disagreement. Who states none adds none.
+    # Of a mixture of two: the variance of each, and that of their difference. A model without a stated one adds none.
     own_V2 = np.where(finite, np.nan_to_num(forward.std_V) ** 2, 0.0)
     there_V2 = np.nan_to_num(other.std_V) ** 2
     mixed = np.sqrt(w * own_V2 + (1.0 - w) * there_V2 + w * (1.0 - w) * (own - there) ** 2)

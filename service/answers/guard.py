@@ -1,4 +1,4 @@
-"""What may leave: finite voltages within the limits, and no faster than the slew limit.
+"""The guard: every voltage is finite, within the limits, and no faster than the slew limit.
 
 `limit_voltage` is the one rule, for the service, a follower, a client's commands and the loop of a stage alike.
 """
@@ -55,7 +55,7 @@ def check_domain(y_um: FloatArray, limits: Limits, field: str = "y_um") -> None:
     """InputError naming the first desired point, (n,) µm, that is not within the displacement limits."""
     if y_um.size == 1 and limits.y_min_um <= y_um.item(0) <= limits.y_max_um:
         return
-    # The two ends decide for all; the search for which one it was is only made for the message.
+    # The extremes decide for all points; only the message needs to know which point it was.
     if y_um.min() >= limits.y_min_um and y_um.max() <= limits.y_max_um:
         return
     bad = int(np.flatnonzero(~((y_um >= limits.y_min_um) & (y_um <= limits.y_max_um)))[0])
@@ -73,7 +73,7 @@ def limit_voltage(u_V: float, previous_V: float, u_min_V: float, u_max_V: float,
     In order: a voltage that is not finite becomes ``previous_V`` (mid-range if there is none); the voltage limits; at
     most ``step_V`` away from ``previous_V``, if that is finite. So from a voltage within the limits none leaves them.
     From one outside, as after a restart with narrower limits, the way back is a ramp: each voltage is ``step_V``
-    nearer, because a jump makes the stage ring. What it returns it leaves as it is when asked again.
+    nearer, because a jump makes the stage ring. Limiting a limited voltage again does not change it.
     """
     flags = 0
     known = math.isfinite(previous_V)

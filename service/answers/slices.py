@@ -1,4 +1,4 @@
-"""A long evaluation in slices: another may have its turn between two of them, and the result is the same to the bit.
+"""Evaluates a long query in slices, between which other queries run; the result is the same to the bit.
 
 Only the LSSVM is cut: a point of it costs as much as fifty of a baseline, and its memory is carried from point to point
 unchanged. The other models convert their memory at the ends of an evaluation, so that a cut would round it.
@@ -23,7 +23,7 @@ Pace = Callable[[int], None]
 
 
 class StoppedError(BaseException):
-    """Ends an evaluation between two slices. No `Exception`: a model that raises one is replaced by the stand-in."""
+    """Ends an evaluation between two slices. Not an `Exception`: the stand-in replaces a model that raises one."""
 
 
 class SlicedLssvm:
@@ -75,7 +75,7 @@ class SlicedLssvm:
         return self._model.track(y_um, v_um_per_s, a_um_per_s2, u_V, memory)
 
     def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """As that of the model: it costs a hundredth of an evaluation."""
+        """As that of the model, in one piece: it costs a hundredth of an evaluation."""
         self._model.carry(y_um, u_V, memory)
 
     def state_dict(self) -> StateDict:

@@ -1,4 +1,4 @@
-"""Which model answers: the tables that decide it, and the one word by which everybody says so.
+"""Which model answers: the tables that decide it, and its name in status, metrics and events.
 
 Three questions, in this order:
 

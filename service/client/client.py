@@ -382,7 +382,7 @@ class RetryingQueries:
 
 
 def _path(field: str, path: object) -> Path | None:
-    """``path`` as a path, None as it is. Raises InputError for all that is none."""
+    """``path`` as a path, None as it is. Raises InputError for any other type."""
     if path is None or isinstance(path, Path):
         return path
     if not isinstance(path, str):
@@ -574,7 +574,7 @@ class Client:
     def follow(
         self, model: str = "", memory: ArrayLike | None = None, *, deltas: bool = True, keep: int = 1
     ) -> Follower:
-        """Follow a model into this process; see :class:`service.client.follower.Follower`. Closed with this client.
+        """Follow a model into this process (:class:`dehyst.service.client.follower.Follower`), closed with this client.
 
         The changes of the learning model and of "auto" are published with every batch that was learnt; any other model
         is constant and fetched once. "auto" holds all competing models: the learning model alone is faster to evaluate.
@@ -602,7 +602,7 @@ class Client:
 
         def fetch() -> bytes:
             payload = self._queries.get(keys.model, parameters, read)
-            # Who answers may be another instance since, with other limits.
+            # Another instance may answer since then, with other limits.
             self._queries.status()
             return payload
 
@@ -701,8 +701,8 @@ class Client:
     def subscribe_commands(self, receive: Callable[[bytes], None]) -> CommandGate:
         """Call ``receive`` with the payload of each command of the owner of ``.../command``, in a thread of zenoh.
 
-        For a stage, which applies them (:class:`service.adapters.StageLoop`). The result counts the commands of others,
-        which are left out, as ``foreign``, and names who sent the last one as ``stranger``; ``undeclare()`` ends it.
+        For a stage, which applies them (:class:`dehyst.service.adapters.StageLoop`). The result counts other
+        commands, which are left out, as ``foreign``; ``stranger`` sent the last one. ``undeclare()`` ends it.
         """
         return CommandGate(self._session, self.keys, self._by, receive)
 

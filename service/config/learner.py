@@ -27,7 +27,7 @@ class LearnerSettings:
 def learner_config(settings: dict[str, Any], limits: Limits, where: str) -> LearnerConfig:
     """The learner's configuration by the table ``where``. Raises InputError on an unknown setting.
 
-    The learner takes a voltage at its limit for saturated; it is told the limits unless the settings do.
+    The learner treats a voltage at a limit as saturated: the limits of the axis, unless the settings give others.
     """
     gates = settings.get("admission", {})
     if isinstance(gates, dict):

@@ -38,7 +38,7 @@ class Frozen:
 
     Attributes
     ----------
-    model : of a champion among contestants, the champion's own. limits : of what leaves. name : of files and functions.
+    model : of a champion among contestants, the champion's own. limits : of voltages. name : of files and functions.
     origin : one line, for people.
     """
 

@@ -1,11 +1,11 @@
-"""The second witness of a sample: the voltage that was commanded for it.
+"""Compares the voltage of each sample with the one that was commanded for it.
 
-A controller that asks for the next voltages names what is under way: the voltages that it has commanded, and the motion
+A controller that asks for the next voltages sends what is under way: the voltages that it has commanded, and the motion
 that they are for, by the numbers of the samples (`service.protocol.query.Pending`). A sample with such a number has to
 show that voltage. Where many in a row do not, the columns are exchanged, scaled or late, or the samples are those of
-another stage. Then what was commanded is the better witness of both voltage and place, from the first such sample on:
-a place of another stage would otherwise stay in the memory of the hysteresis. Only a sample that shows the voltage of
-the one before is believed until the difference is named: a stage that missed a command holds its voltage.
+another stage. Commanded voltage and place then replace those of the samples, from the first such sample on: a place of
+another stage would otherwise stay in the memory of the hysteresis. Until the difference is named, only a sample that
+shows the voltage of the one before is believed: a stage that missed a command holds its voltage.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _NEIGHBOURS: Final = 1
 #: A sample that differs adds one, one that agrees takes one away. Samples differ from this count on, until it is 0.
 DIFFERS_FROM: Final = 10
 _MOST_DOUBT: Final = 2 * DIFFERS_FROM
-#: Only who has told the voltage of this many samples that moved is believed: a voltage that is read back by another
-#: scale, or that of somebody who asks without moving the stage, never agrees.
+#: A controller counts only after its voltages agreed with this many samples that moved: a voltage that is read back in
+#: another scale, or that of a client that does not move the stage, never agrees.
 _CREDIT: Final = 50
 #: Queries that are kept: at one a sample, more than samples wait in messages and queue.
 _KEPT: Final = 256
@@ -107,7 +107,7 @@ class CommandWitness:
 
     def _agrees(self, u_V: float, difference_V: float) -> None:
         self._differences_V2 += (difference_V**2 - self._differences_V2) / _OVER
-        # A stage that holds its place agrees with everybody who has asked for that place.
+        # A stage at rest agrees with every client that has asked for its place.
         if not abs(u_V - self._moved_V) <= self._most_V:
             self._moved_V = u_V
             self._credit = min(self._credit + 1, _CREDIT)

@@ -1,6 +1,6 @@
 """The status of all axes as metrics of Prometheus: ``page`` makes the text, ``serve_page`` serves it over HTTP.
 
-Each reading asks the services anew, so a page never shows what is no longer so. An axis that does not answer is
+Each reading asks the services anew, so a page is never out of date. An axis that does not answer is
 missing, and ``dehyst_up`` tells how many instances answered.
 """
 

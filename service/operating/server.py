@@ -30,7 +30,7 @@ from dehyst.service.storage.output import append_line
 FILE: Final = "operations.jsonl"
 FILE_BEFORE: Final = "operations.1.jsonl"
 FREEZE, THAW = "freeze", "thaw"
-#: What standbys are told of: their model changes otherwise than by samples.
+#: Verbs that change the model other than by samples: standbys must take them too.
 _TOLD: Final = (FREEZE, THAW, "select", "rollback")
 #: Beside the journal: a file whose room on the disk the journal takes when the disk is full, and its size, bytes.
 RESERVE: Final = ".operations-reserve"

@@ -1,4 +1,4 @@
-"""Errors of the wire and the processes, below :class:`adaptive.errors.DehystError`.
+"""Errors of the wire and the processes, below :class:`dehyst.adaptive.errors.DehystError`.
 
 ::
 

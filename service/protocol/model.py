@@ -116,8 +116,8 @@ class Safety:
     ----------
     blends : True if the stand-in also answers outside the domain of the model and by its trust; False if it answers
         only where the model is not finite.
-    blend_share, trust : see :class:`service.answers.fallback.Rules`.
-    stale_s, last_good_s : see :class:`service.config.settings.AxisConfig`.
+    blend_share, trust : see :class:`dehyst.service.answers.fallback.Rules`.
+    stale_s, last_good_s : see :class:`dehyst.service.config.settings.AxisConfig`.
     stand_in : None if there is none.
     trouble : name of what is wrong with the samples or the learner, "" while nothing is. Followers without a correction
         need not know it.

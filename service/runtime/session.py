@@ -49,7 +49,7 @@ def wait_followed(publisher: Any, within_s: float) -> bool:
 # --- Sessions.
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-#: No hand-over between thread pools: this halves the round trip (docs/protocol.md, "Latency"). Several network threads,
+#: No hand-over between thread pools: that halves the round trip (docs/protocol.md, "Connecting"). More network threads,
 #: because closing the connection to a stopped receiver blocks one of them for up to ten seconds. Sending has its own
 #: thread: a service forwards messages between its clients, and if the receiving thread also had to free the send
 #: queue it waits for, the service would deadlock.

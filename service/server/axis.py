@@ -131,7 +131,7 @@ class EventLog:
 
 
 class EventLimiter:
-    """Limits repeated events: the first of a kind is told, and the next one after ``calm`` samples without any.
+    """Limits repeated events: it allows the first of a kind, and the next one after ``calm`` samples without any.
 
     A flood counts as one event; the counters still count each.
     """

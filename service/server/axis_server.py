@@ -1,4 +1,4 @@
-"""One axis on the wire: its subscriber, and what comes and goes with serving, down to the liveliness token."""
+"""One axis on the wire: its subscriber, and its queryables, publishers and liveliness token while it serves."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class AxisServer:
     ----------
     role : "primary" while it serves, else "standby". epoch : number of its take-over, see `RoleControl`.
     synced : whether the model is the one to be served: its own, or, of a standby, that of the serving instance.
-    claims_refused : count of claims of others that prove nothing.
+    claims_refused : count of claims whose instance did not prove that it serves.
     loop : the thread of the axis. checkpoints : writes them.
     """
 
@@ -142,7 +142,7 @@ class AxisServer:
         self._publications.listen()
 
     def serve(self) -> None:
-        """Answer and publish from now on; the liveliness token comes last, because alive means callable."""
+        """Answer and publish from now on. The liveliness token comes last: clients query an instance that has one."""
         session = self._session
         with self._changing:
             self.role = PRIMARY
@@ -153,7 +153,7 @@ class AxisServer:
             self._token = session.liveliness().declare_token(self.keys.alive(self.instance))
 
     def stand_down(self) -> None:
-        """First no longer alive, then no longer callable; samples are still taken."""
+        """Withdraw the liveliness token, then the queryables; samples are still taken."""
         with self._changing:
             self.role = STANDBY
             self.loop.set_tuning(False)
@@ -179,7 +179,7 @@ class AxisServer:
         self.epoch = epoch
 
     def set_claims_refused(self, count: int) -> None:
-        """How many claims were ignored because they prove nothing."""
+        """How many claims were ignored because their instance did not prove that it serves."""
         self.claims_refused = count
 
     def undeclare(self) -> None:

@@ -62,7 +62,7 @@ from dehyst.service.protocol.model import build_model, stored_kind
 
 #: Verdicts on samples whose values cannot be used: they move no memory.
 UNUSABLE: Final = frozenset({NOT_FINITE, OUT_OF_RANGE, TIMING})
-#: Verdict on samples that nobody learns from.
+#: Verdict on samples where no model learns.
 NOT_LEARNING: Final = "not_learning"
 #: Verdict on samples of which neither voltage nor reading is believed.
 NOT_COMMANDED: Final = "not_commanded"

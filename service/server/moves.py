@@ -38,7 +38,7 @@ class Move(NamedTuple):
 
 
 class Moves:
-    """Collects the moves of one axis at sample numbers that do not depend on the messages, for who follows.
+    """Collects the moves of one axis at sample numbers that do not depend on the messages, for followers.
 
     Parameters
     ----------

@@ -85,8 +85,8 @@ class QueryAnswers:
     Parameters
     ----------
     long_queries : answers the feedforward queries that are not short.
-    latency : takes the time of every short one. status : makes the status.
-    authenticator : signs the answers, and tells who may have the state.
+    latency : measures every short one. status : makes the status.
+    authenticator : signs the answers, and decides who gets the state.
     deltas : the models whose changes are published.
 
     Attributes
@@ -141,7 +141,7 @@ class QueryAnswers:
             if payload is None:
                 raise FieldError("payload", "none", "a feedforward query")
             size = len(payload)
-            # To copy a megabyte takes as long as to answer ten points: the other thread does it.
+            # Copying a megabyte takes as long as answering ten points: the other thread does it.
             data = payload.to_bytes() if size <= _COPIED_BYTES else None
             points = min(size // _POINT_BYTES, MAX_COUNT) if data is None else points_of(data)
             if points > SHORT:
@@ -217,7 +217,7 @@ class QueryAnswers:
         """Reply with the state, from a thread of its own: the copy waits for the learner, and a callback must not."""
         try:
             check_parameters(query.parameters)
-            # First: strangers must not keep the places of instances, or have a thread each.
+            # Check the signature first: strangers must neither take the places of instances nor cost a thread each.
             if not self._by.is_asked_by_ours(query, self._keys.state):
                 self.states_refused += 1
                 raise ServiceError("the state is for instances of this service: sign the query, each time anew")
@@ -258,7 +258,7 @@ def guarded(
     parameters: tuple[str, ...] = (),
     authenticator: Authenticator = NO_KEY,
 ) -> Callable[[zenoh.Query], None]:
-    """A callback that replies to each query, and never raises: what ``answer`` raises goes to ``failed`` and back.
+    """A callback that replies to each query and never raises: what ``answer`` raises goes to ``failed`` and the reply.
 
     ``parameters`` : those that its selector may have. ``authenticator`` : signs the reply.
     """

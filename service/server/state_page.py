@@ -35,7 +35,7 @@ memory, N: samples of the window; any other name, and `*`, is a length of that e
 once, where it comes first. The entries of a stored model are those of its
 [payload](protocol.md#evaluating-a-model).
 """
-#: Title of each table, where its entries are, and who declares them.
+#: Title of each table, where its entries are, and the class that declares them.
 _TABLES: Final[tuple[tuple[str, str, Any], ...]] = (
     ("The axis", "", AxisEntries),
     ("Numbers of samples", "sequence.", SequenceTracker),

@@ -137,8 +137,8 @@ class CheckpointFolder:
     def pin(self, now_s: float, until_s: float) -> frozenset[int]:
         """Keep all that stay by their age at ``now_s`` until ``until_s`` (``time.monotonic``) at least; their numbers.
 
-        A full disk still takes them. One that is there only because it was pinned before is not pinned again: who lists
-        them all the time must not keep them all.
+        A full disk still takes them. One that is kept only by an earlier pin is not pinned again: frequent listing must
+        not keep them all.
         """
         numbers = self.numbers()
         kept = self._regular(max(numbers, default=0), numbers)
@@ -219,7 +219,7 @@ class CheckpointFolder:
         for path in self._paths():
             if number_of(path) not in keep:
                 path.unlink(missing_ok=True)
-        for part in self.directory.glob("*checkpoint-*part"):  # of a process that was killed while it wrote
+        for part in self.directory.glob("*checkpoint-*part"):  # left by a process that was killed while it wrote
             part.unlink(missing_ok=True)
 
 

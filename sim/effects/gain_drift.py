@@ -48,8 +48,7 @@ def derive_gain_drift(values: Mapping[str, float], context: Context) -> Sequence
 
 @dataclass(frozen=True)
 class GainDrift(SlowChange):
-    """A slow change of the gain about a displacement that stays: an actuator's zero, or the zero of a sensor, which has
-    any offset."""
+    """A slow change of the gain about a fixed displacement: the actuator's zero, or a sensor's, with any offset."""
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         if self.variant == "temperature":
@@ -113,11 +112,11 @@ def in_rests(readings: Readings) -> Sight:
 
 
 def in_cycles(readings: Readings) -> Sight:
-    """The height of equal cycles goes with time."""
+    """The height of equal cycles changes with time."""
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    # Creep settles with the logarithm of time, which is as good as straight long after its beginning.
+    # Creep settles with the logarithm of time, which is almost a straight line long after the start.
     return Sight(found.grew, found.height_words, found.also if found.grew else ())
 
 

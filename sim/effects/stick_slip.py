@@ -77,7 +77,7 @@ class StickSlip(CauseModel):
     """Friction, see `friction`: the stage sticks after each reversal, then slides behind by a share of the width.
 
     ``variant`` "gradual": the contact breaks free in parts, so the stage begins to slide before it has moved by the
-    width (presliding): plays of the motion side by side, ``gradual_share`` of whose radii differs.
+    width (presliding): parallel plays of the motion; ``gradual_share`` spreads their radii.
     """
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:

@@ -137,7 +137,7 @@ class LineSpectra:
 
     @property
     def floor_um(self) -> FloatArray:
-        """(p,) rms of the noise of the mean period, µm: no model can come below it."""
+        """(p,) rms of the noise of the mean period, µm: the least error of any model."""
         return np.asarray(self.noise_um / np.sqrt(self.periods), dtype=np.float64)
 
 
@@ -280,7 +280,7 @@ class FrequencyResponse:
 
     @property
     def distortion_um(self) -> FloatArray:
-        """(p,) rms of noise and distortion in one realisation, µm: no linear model of this amplitude is below it."""
+        """(p,) rms of noise and distortion in one realisation, µm: the least error of a linear model."""
         return np.asarray(np.sqrt(2.0 * self.total.sum(axis=0)), dtype=np.float64)
 
 

@@ -60,7 +60,7 @@ class StageState:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A run in full, arrays (n,): readings and true displacements (before the sensor) µm, voltage at the actuator V."""
+    """All of a run, arrays (n,): readings and true displacements (before the sensor) µm, voltage at the actuator V."""
 
     t_s: FloatArray
     y_um: FloatArray
