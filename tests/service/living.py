@@ -138,7 +138,7 @@ def settled(value: Callable[[], Any], quiet_s: float, within_s: float = 60.0) ->
     return last
 
 
-def eventually(condition: Any, within_s: float = 30.0) -> Any:
+def eventually(condition: Any, within_s: float = 60.0) -> Any:
     """The first true value of ``condition``; fails after ``within_s``."""
     until = time.monotonic() + within_s
     while not (value := condition()):

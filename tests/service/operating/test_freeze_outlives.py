@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,6 @@ def test_with_both_it_starts_with_the_same_model_to_the_last_bit(serve: Serve, t
         with Client.connect(again.endpoint, axis="x", timeout_s=5.0) as client:
             prints.append(client.status()["fingerprint"])
         assert again.stop(signal.SIGTERM)[0] == 0
-        time.sleep(0.1)
     assert prints[0] == prints[1]
     with Client.connect(serve(extra=extra).endpoint, axis="x", timeout_s=5.0) as client:
         assert client.status()["frozen"] is True

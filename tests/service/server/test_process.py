@@ -225,29 +225,29 @@ def _sockets(pid: int) -> set[str]:
 
 
 @pytest.mark.e2e
-def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: Callable[..., Any]) -> None:
+def test_samples_that_come_and_are_lost_are_a_trouble(serve: Callable[..., Any]) -> None:
     process = serve(extra="queue_samples = 60\n")
-    with Client.connect(process.endpoint, axis="x", timeout_s=2.0) as client, open_client(process.endpoint) as stage:
+    with Client.connect(process.endpoint, axis="x", timeout_s=5.0) as client, open_client(process.endpoint) as stage:
 
-        def trouble_of(first: int, n: int, step: int) -> str:
-            """The first trouble while messages of n samples from ``first`` on come for three seconds."""
-            until, at = time.monotonic() + 3.0, first
-            while time.monotonic() < until:
+        def trouble_of(first: int, n: int, step: int, messages: int) -> str:
+            """The first trouble while so many messages of n samples from ``first`` on come, 50 a second."""
+            for at in range(first, first + messages * step, step) if step else range(messages):
                 stage.put(client.keys.sample, samples(at, n) if n else b"rubbish")
-                at += step
                 time.sleep(0.02)
-                if (name := client.status()["trouble"]) and time.monotonic() > until - 2.9:
-                    return str(name)
+                # The next one when this one is handled: on a busy machine more than fit would wait.
+                status = eventually(lambda: (s := client.status())["samples"]["waiting"] == 0 and s)
+                if status["trouble"]:
+                    return str(status["trouble"])
             return ""
 
-        assert trouble_of(0, 20, 20) == ""
-        for name, lost in (
-            ("samples_dropped", lambda: trouble_of(10_000, 100, 100)),
-            ("samples_malformed", lambda: trouble_of(0, 0, 0)),
-            ("samples_lost", lambda: trouble_of(30_000, 10, 20)),
+        assert trouble_of(0, 20, 20, 150) == ""
+        for name, first, n, step in (
+            ("samples_dropped", 10_000, 100, 100),
+            ("samples_malformed", 0, 0, 0),
+            ("samples_lost", 30_000, 10, 20),
         ):
-            assert lost() == name
-            eventually(lambda: client.status()["trouble"] == "", 5.0)
+            assert trouble_of(first, n, step, 1000) == name
+            eventually(lambda: client.status()["trouble"] == "")
 
 
 def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) -> None:
@@ -268,10 +268,10 @@ def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) 
                 u_V, y_um = answer.u_V, 1.0 + 10.45 * answer.u_V
                 put.put(wire.encode_samples(k, k * DT_S, *((y_um, u_V) if exchanged else (u_V, y_um))))
                 begin += n
-                time.sleep(0.004)
+                client.wait_learnt(begin - 1)
 
         def handled() -> dict[str, Any]:
-            return eventually(lambda: (status := client.status())["seq"] == begin - 1 and status)
+            return client.status()
 
         play(2.0, exchanged=False)
         assert handled()["trouble"] == ""
@@ -284,8 +284,8 @@ def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) 
         play(1.0, exchanged=False)
         good = handled()
         assert good["trouble"] == ""
-        # The voltages went on all the while: the stage is within 2 % of its range of where it was wanted. (On a busy
-        # machine the learner has seen fewer samples; what is exchanged and believed costs 9 to 15 %.)
+        # The voltages went on all the while: the stage is within 2 % of its range of where it was wanted; what is
+        # exchanged and believed costs 9 to 15 %.
         for said in (before, answer):
             k = np.arange(begin - n - (0 if said is answer else 1000), begin - (0 if said is answer else 1000))
             wanted_um = 45.0 + 30.0 * np.sin(2.0 * np.pi * 2.0 * k * DT_S)

@@ -6,7 +6,6 @@ import errno
 import io
 import json
 import shutil
-import time
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -75,17 +74,22 @@ def test_a_recording_folder_that_vanishes_is_degraded_and_made_anew(tmp_path: Pa
             shutil.rmtree(where)
         else:
             where.rename(tmp_path / "elsewhere")
-        seen: list[dict[str, Any]] = []
-        for first in range(100, 2000, 50):
-            k = np.arange(first, first + 50)
+        last = 100
+
+        def counts_after(n: int) -> dict[str, Any]:
+            """Of the recorder, when it has taken n more samples."""
+            nonlocal last
+            k, last = np.arange(last, last + n), last + n
             recorder.put(k, k * DT_S, k * 0.1, k * 0.2, "learnt")
-            time.sleep(0.03)
-            seen.append(recorder.counters())
-        assert any(counts["degraded"] and "vanished" in counts["error"] for counts in seen)
-        assert seen[-1]["errors"] == 1
-        rows = rows_behind(where, 1900, "")
+            return eventually(lambda: (counts := recorder.counters())["waiting"] == 0 and counts)
+
+        told = eventually(lambda: (counts := counts_after(50))["degraded"] and counts)
+        assert "vanished" in told["error"]
+        eventually(lambda: counts_after(50)["written"] == last)
+        assert recorder.counters()["errors"] == 1
+        rows = rows_behind(where, last - 50, "")
         assert rows is not None
-        assert int(rows.seq[-1]) >= 1900
+        assert int(rows.seq[-1]) == last - 1
     assert recorder.counters()["lost"] == 0
 
 
