@@ -282,7 +282,7 @@ def test_more_than_can_wait_is_refused_at_once_and_a_flood_is_journaled_as_a_num
         errors = [line["error"] for line in lines if not line["ok"]]
         return sum(int(error.split()[0]) if "more requests" in error else 1 for error in errors)
 
-    eventually(lambda: told() == refused, 10.0)
+    eventually(lambda: told() == refused)
     assert len((tmp_path / "operations.jsonl").read_text().splitlines()) < 80
 
 
