@@ -28,7 +28,7 @@ from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_aut
 from dehyst.service.security.lease import CommandGate, CommandLease
 from dehyst.service.security.tokens import Holder
 from dehyst.service.stage_node.node import status_key
-from tests.service.living import eventually
+from tests.service.living import Process, eventually
 
 pytestmark = pytest.mark.e2e
 
@@ -62,20 +62,7 @@ class Stage:
     """A stage that runs free beside the service, what it applied, and what it says."""
 
     def __init__(self, endpoint: str) -> None:
-        command = [
-            sys.executable,
-            "-m",
-            "dehyst.lab.cli",
-            "stage",
-            "--endpoint",
-            endpoint,
-            "--free-run",
-            "--batch",
-            "5",
-        ]
-        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline().startswith("ready")
+        self.process = Process("stage", "--endpoint", endpoint, "--free-run", "--batch", "5")
         self.session = open_client(endpoint, 10.0)
         self.u_V: list[float] = []
         self.seq = -1
@@ -98,7 +85,6 @@ class Stage:
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
         self.process.kill()
-        self.process.communicate(timeout=20)
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from dehyst.service.stage_node.node import status_key
 from dehyst.sim.stage.presets import preset
 from dehyst.sim.stage.stage import Stage
 from tests.service.conftest import unused_port
-from tests.service.living import eventually
+from tests.service.living import Process, eventually
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -32,24 +32,17 @@ ROOT = Path(__file__).resolve().parents[3]
 @contextmanager
 def stage_process(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
-    command = [sys.executable, "-m", "dehyst.lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
+    stage = Process("stage", "--listen", endpoint, "--name", "t", *options)
     try:
-        line = process.stdout.readline()
-        assert line.startswith("ready: stage t"), line
-        yield process, endpoint
+        yield stage.process, endpoint
     finally:
-        process.kill()
-        process.stdout.close()
-        process.wait(10)
+        stage.kill()
 
 
 def summary_of(process: subprocess.Popen[str]) -> dict[str, object]:
-    assert process.stdout is not None
-    text = process.stdout.readlines()[-1]
-    assert process.wait(10) == 0
-    loaded: dict[str, object] = json.loads(text)
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 0
+    loaded: dict[str, object] = json.loads(said.splitlines()[-1])
     return loaded
 
 
