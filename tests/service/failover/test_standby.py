@@ -12,13 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zenoh
 
 from dehyst.service.client.client import Client
 from dehyst.service.config.settings import read_config
-from dehyst.service.failover.role_control import Claims
 from dehyst.service.operating.remote import operate
 from dehyst.service.operating.server import Journal
 from dehyst.service.protocol.keys import Keys
@@ -353,27 +351,6 @@ def test_a_standby_that_must_serve_before_its_first_state_goes_on_from_its_own_f
             assert took["synced"] is False
         finally:
             service.close()
-
-
-def test_the_greatest_claim_serves() -> None:
-    keys = Keys("demo", "x")
-    claims = Claims(keys, "i-me")
-    assert (claims.highest(), claims.next_epoch()) == (None, 1)
-    claims.update(keys.token("claim", "3/i-me"), True)  # one's own is no news
-    assert claims.highest() is None
-    claims.update(keys.token("claim", "1/i-b"), True)
-    claims.update(keys.token("claim", "2/i-a"), True)
-    claims.update(keys.token("claim", "2/i-c"), True)
-    assert claims.highest() == Claim(2, "i-c")
-    claims.update(keys.token("claim", "2/i-c"), False)
-    assert claims.highest() == Claim(2, "i-a")
-    claims.update(keys.token("claim", "2/i-a"), False)
-    claims.update(keys.token("claim", "1/i-b"), False)
-    assert (claims.highest(), claims.next_epoch()) == (None, 3)
-    claims.update("dehyst/v1/demo/x/alive/i-b", True)
-    assert claims.highest() is None
-    assert Claim.read(NO_KEY, keys, "x") is None
-    assert np.all([Claim(2, "a") > Claim(1, "z"), Claim(2, "b") > Claim(2, "a")])
 
 
 def test_a_standby_needs_ears_of_its_own(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
-from dehyst.service.operating.remote import operate, screen, statuses, table
+from dehyst.service.operating.remote import operate, screen, statuses
 from dehyst.service.operating.server import RESERVE, Journal, OperationsServer, Switch
 from dehyst.service.operating.verbs import MAX_BYTES, Request, decode_request, encode_request
 from dehyst.service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
@@ -99,30 +99,6 @@ def request(client: zenoh.Session, payload: bytes | None) -> Any:
     """The replies to a request that carries the key."""
     attachment = own_authenticator().question(payload=payload or b"", key=KEYS.operate).attachment
     return client.get(KEYS.operate, payload=payload, attachment=attachment, timeout=10.0)
-
-
-def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
-    axis = FakeAxis()
-    server, events = make(axis, tmp_path)
-    for payload in (ask("freeze"), ask("thaw"), ask("select", model="linear"), ask("rollback", checkpoint=3)):
-        answer = json.loads(server.handle(payload))
-        assert (answer["ok"], answer["seq"], answer["who"], answer["instance"]) == (True, 41, "alice", "i1-00")
-    assert axis.done == [
-        ("freeze", "alice"),
-        ("thaw", "alice"),
-        ("select", "linear", "alice"),
-        ("rollback", 3, "alice"),
-    ]
-    assert json.loads(server.handle(ask("checkpoints")))["result"]["checkpoints"][0]["checkpoint"] == 3
-    assert json.loads(server.handle(ask("retune")))["result"] == {"started": True, "job": 3}
-    assert events == [("operation", "alice: retune {}")]  # the others tell an event of their own
-    lines = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
-    assert [line["verb"] for line in lines] == ["freeze", "thaw", "select", "rollback", "checkpoints", "retune"]
-    assert lines[2] == {
-        "time_unix_s": 1234.5, "who": "alice", "verb": "select", "arguments": {"model": "linear"},
-        "instance": "i1-00", "ok": True, "seq": 41, "samples": 0,
-    }  # fmt: skip
-    assert server.counters() == {"done": 6, "refused": 0, "unsigned": 0, "unlogged": 0}
 
 
 @pytest.mark.parametrize(
@@ -365,17 +341,6 @@ STATUS: dict[str, Any] = {
     "samples": {"learnt": 9000, "lost": 2, "dropped": 0, "gates": {"learnt": 9000, "saturated": 70, "late": 5}},
     "queries": {"count": 88, "errors": 1, "p50_us": 101.4, "p99_us": 240.0},
 }  # fmt: skip
-
-
-def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing() -> None:
-    frozen = {**STATUS, "axis": "y", "state": "frozen", "role": "standby"}
-    lines = table([STATUS, frozen, {"stage": "a", "axis": "b", "instance": "c"}]).splitlines()
-    assert len(lines) == 4
-    for word in ("demo/x", "i1-ab", "primary", "ok", "lssvm_adaptive", "12345", "9000", "101", "240", "saturated:70"):
-        assert word in lines[1]
-    assert "frozen" in lines[2]
-    assert "standby" in lines[2]
-    assert table([]).splitlines()[-1] == "no instance replies"
 
 
 def test_what_others_say_moves_no_cursor() -> None:

@@ -163,13 +163,6 @@ def test_what_cannot_be_served_ends_with_a_message(
         assert "Traceback" not in ended.stderr
 
 
-def test_the_example_is_printed_and_help_names_units() -> None:
-    example = dehyst("serve", "--example")
-    assert example.returncode == 0
-    assert "slew_V_per_s" in example.stdout
-    assert "µm" in dehyst("query", "--help").stdout
-
-
 def test_the_serving_process_imports_neither_torch_nor_plots_nor_a_diagnosis() -> None:
     code = (
         "import sys, dehyst.service.server.process, dehyst.service.cli.commands.serve\n"
