@@ -17,13 +17,7 @@ from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.types import FloatArray, Hyperparameters, InverseModel
 from dehyst.baselines import fit_linear, fit_mpi
 from dehyst.service.answers.guard import Limits
-from dehyst.service.background.adoptions import (
-    ADOPTIONS_FILE,
-    Adoptions,
-    Retuned,
-    append_adoption,
-    read_adoptions,
-)
+from dehyst.service.background.adoptions import ADOPTIONS_FILE, Adoptions, Retuned, append_adoption, read_adoptions
 from dehyst.service.background.retuner import Retuner
 from dehyst.service.background.retuning_worker import start_job
 from dehyst.service.background.settings import RetuningConfig

@@ -123,10 +123,7 @@ def test_bad_input_gets_an_error_reply_and_the_service_lives_on(serve: Callable[
 
 def test_several_axes_are_served_apart(shared_service: Any) -> None:
     endpoint = shared_service.endpoint
-    with (
-        Client.connect(endpoint, axis="x", timeout_s=5.0) as x,
-        Client.connect(endpoint, axis="y", timeout_s=5.0) as y,
-    ):
+    with Client.connect(endpoint, axis="x", timeout_s=5.0) as x, Client.connect(endpoint, axis="y", timeout_s=5.0) as y:
         y._session.put(y.keys.sample, samples(0, 500))
         eventually(lambda: y.status()["seq"] == 499)
         assert x.status()["seq"] == -1
