@@ -28,6 +28,7 @@ from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_aut
 from dehyst.service.security.lease import CommandGate, CommandLease
 from dehyst.service.security.tokens import Holder
 from dehyst.service.stage_node.node import status_key
+from tests.service.conftest import ServeProcess
 from tests.service.living import Process, eventually
 
 pytestmark = pytest.mark.e2e
@@ -87,12 +88,19 @@ class Stage:
         self.process.kill()
 
 
-@pytest.fixture
-def stage(serve: Callable[..., Any]) -> Iterator[tuple[Stage, str]]:
-    process = serve()
-    found = Stage(process.endpoint)
-    yield found, process.endpoint
+@pytest.fixture(scope="module")
+def running(shared_service: ServeProcess) -> Iterator[Stage]:
+    found = Stage(shared_service.endpoint)
+    yield found
     found.close()
+
+
+@pytest.fixture
+def stage(shared_service: ServeProcess, running: Stage) -> tuple[Stage, str]:
+    """A stage that nobody commands, and where it is found."""
+    running.said.clear()  # it says so once a second
+    eventually(lambda: running.said.get("owner", "unknown") is None)
+    return running, shared_service.endpoint
 
 
 @pytest.fixture
@@ -134,7 +142,7 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
 ) -> None:
     """Before, the stage got the voltages of both, in steps of 4 V."""
     found, endpoint = stage
-    before = len(found.u_V)
+    before, foreign = len(found.u_V), found.said["foreign"]
     error = said_by(start(endpoint, 6.0))
     assert f"process {first.pid} on {socket.gethostname()} since 2" in error
     assert "End that one" in error
@@ -149,7 +157,7 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
             client.take_command()
         assert held.value.holder.startswith(f"process {first.pid} on ")
     eventually(lambda: found.said.get("owner") == owner)
-    assert found.said["foreign"] == 0
+    assert found.said["foreign"] == foreign
 
 
 def test_after_kill_9_the_next_one_gets_through(
@@ -202,6 +210,7 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
     stage: tuple[Stage, str],
 ) -> None:
     found, endpoint = stage
+    foreign, refused = found.said["foreign"], found.said["refused"]
     recorded: list[tuple[bytes, Any]] = []
     with open_client(endpoint, 5.0) as stranger, Client.connect(endpoint, timeout_s=5.0) as client:
         stranger.declare_subscriber(KEYS.command, lambda s: recorded.append((s.payload.to_bytes(), s.attachment)))
@@ -229,12 +238,12 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
             time.sleep(0.01)
         eventually(lambda: len(found.u_V) > before + 500)
         assert set(found.u_V[before:]) == {2.0}
-        eventually(lambda: found.said.get("foreign") == 250)
+        eventually(lambda: found.said["foreign"] == foreign + 250)
         assert found.said["stranger"] == "somebody who repeats the owner's"
         assert found.said["owner"]["process"] == os.getpid()
-        assert (found.said["others"], found.said["refused"]) == ([], 4)
+        assert (found.said["others"], found.said["refused"]) == ([], refused + 4)
         command = client.status()["command"]
-        assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), 4)
+        assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), refused + 4)
         lease.undeclare()
         del tokens
 
