@@ -17,6 +17,7 @@ import zenoh
 
 from dehyst.service.client.client import Client
 from dehyst.service.config.settings import read_config
+from dehyst.service.failover.role_control import Claims
 from dehyst.service.operating.remote import operate
 from dehyst.service.operating.server import Journal
 from dehyst.service.protocol.keys import Keys
@@ -351,6 +352,22 @@ def test_a_standby_that_must_serve_before_its_first_state_goes_on_from_its_own_f
             assert took["synced"] is False
         finally:
             service.close()
+
+
+def test_the_greatest_claim_serves() -> None:
+    keys = Keys("demo", "x")
+    claims = Claims(keys, "i-me")
+    assert (claims.highest(), claims.next_epoch()) == (None, 1)
+    claims.update(keys.token("claim", "3/i-me"), True)  # one's own is no news
+    assert claims.highest() is None
+    for token in ("1/i-b", "2/i-a", "2/i-c"):
+        claims.update(keys.token("claim", token), True)
+    assert claims.highest() == Claim(2, "i-c")
+    claims.update(keys.token("claim", "2/i-c"), False)
+    assert claims.highest() == Claim(2, "i-a")
+    for token in ("2/i-a", "1/i-b"):
+        claims.update(keys.token("claim", token), False)
+    assert (claims.highest(), claims.next_epoch()) == (None, 3)
 
 
 def test_a_standby_needs_ears_of_its_own(tmp_path: Path) -> None:
