@@ -430,6 +430,7 @@ def test_the_commands_against_a_real_service(
     journal = [json.loads(line) for line in (tmp_path / "rec-y" / "operations.jsonl").read_text().splitlines()]
     assert {line["who"] for line in journal} == {"alice"}
     assert [line["verb"] for line in journal] == ["freeze", "thaw", "select", "checkpoints", "rollback", "rollback"]
+    assert (journal[2]["arguments"], journal[2]["seq"]) == ({"model": "linear"}, 1099)
     times = [began_at, *(line["time_unix_s"] for line in journal), time.time()]
     assert times == sorted(times)
     assert [line["ok"] for line in journal] == [True] * 5 + [False]
