@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from dehyst.service.client.client import Client
+from dehyst.service.failover import state_transfer
 from dehyst.service.failover.role_control import Claims
 from dehyst.service.failover.state_transfer import fetch_state, status_of, tell_standbys
 from dehyst.service.protocol.errors import ServiceError
@@ -175,8 +176,9 @@ def test_a_freeze_that_a_stranger_tells_again_is_none(endpoint: str) -> None:
     assert told == [True, False, False, False]
 
 
-def test_who_stands_still_while_it_asks_takes_nobody_for_dead(endpoint: str) -> None:
+def test_who_stands_still_while_it_asks_takes_nobody_for_dead(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time is over when it goes on; the other one answers the next query."""
+    monkeypatch.setattr(state_transfer, "_LIFE_S", 2.0)
     answers = [False]
 
     def answer(query: zenoh.Query) -> None:
@@ -184,13 +186,13 @@ def test_who_stands_still_while_it_asks_takes_nobody_for_dead(endpoint: str) -> 
             if answers[0]:
                 query.reply(KEYS.status, LIFE, attachment=OURS.answered(query, KEYS.status, LIFE))
             else:
-                time.sleep(0.7)
+                time.sleep(2.2)
                 answers[0] = True
 
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
         queryable = serving.declare_queryable(KEYS.status, answer)
         declared(serving, asking)
-        assert status_of(asking, KEYS.status, "i-peer", 0.6, OURS) is not None
+        assert status_of(asking, KEYS.status, "i-peer", 2.05, OURS) is not None
         answers[0] = False
         begin = time.monotonic()
         assert status_of(asking, KEYS.status, "i-peer", 5.0, OURS, lambda: False) is None
