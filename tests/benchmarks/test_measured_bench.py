@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import measured
-from benchmarks.measured import (
-    SCORES,
-    Record,
-    Source,
-    data_folder,
-    least_squares,
-    main,
-    plays,
-    recursive,
-    replayed,
-)
+from benchmarks.measured import SCORES, Record, Source, data_folder, least_squares, main, plays, recursive, replayed
 from dehyst.baselines import fit_linear
 from dehyst.service.config.settings import COMPETE
 from dehyst.service.identification.identifying import Stretch

@@ -9,12 +9,7 @@ import pytest
 
 from dehyst.lab.rehearsal.reference import BEGIN_S, REST_S, Motion, ReferenceRequest
 from dehyst.lab.rehearsal.runs import times
-from tests.foreign.motions import (
-    MOTIONS,
-    NIGHT_FROM_S,
-    MotionMaker,
-    motion,
-)
+from tests.foreign.motions import MOTIONS, NIGHT_FROM_S, MotionMaker, motion
 
 #: Rests of the tests, s.
 STILL_S = 3.0

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ from dehyst.adaptive.types import InverseModel
 from dehyst.baselines.common import Domain
 from dehyst.baselines.linear import LinearInverse, LinearParameters
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
+from tests.service.living import Process
 
 DT_S = 1e-3
 GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
@@ -91,34 +89,18 @@ def write_config(folder: Path, port: int, axes: tuple[str, ...] = ("x",), extra:
     return path
 
 
-class ServeProcess:
+class ServeProcess(Process):
     """``dehyst serve`` as a process, ready when constructed."""
 
     def __init__(self, config: Path, port: int) -> None:
         self.endpoint = f"tcp/127.0.0.1:{port}"
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "dehyst.lab.cli", "serve", "--config", str(config), "--json"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            pytest.fail(f"dehyst serve did not come up: {self.process.communicate(timeout=20)[1]}")
-        self.ready: dict[str, Any] = json.loads(line)
+        super().__init__("serve", "--config", str(config))
 
     def stop(self, number: int = signal.SIGTERM) -> tuple[int, dict[str, Any], str]:
         """(exit status, last line of its output, what it complained of)."""
         self.process.send_signal(number)
         out, err = self.process.communicate(timeout=30)
         return self.process.returncode, json.loads(out.splitlines()[-1]), err
-
-    def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.communicate(timeout=20)
 
 
 @pytest.fixture(scope="module")

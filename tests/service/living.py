@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +118,27 @@ class Asker:
             time.sleep(0.001)
 
 
-def eventually(condition: Any, within_s: float = 30.0) -> Any:
+def declared(session: zenoh.Session, other: zenoh.Session) -> None:
+    """Wait until the wire knows all that ``session`` has declared: ``other`` sees a token that it declares last."""
+    key = f"test/declared/{uuid.uuid4().hex}"
+    token = session.liveliness().declare_token(key)
+    eventually(lambda: any(reply.ok for reply in other.liveliness().get(key, timeout=5.0)))
+    token.undeclare()
+
+
+def settled(value: Callable[[], Any], quiet_s: float, within_s: float = 60.0) -> Any:
+    """``value()`` once it has not changed for ``quiet_s``; fails after ``within_s``."""
+    last, until = value(), time.monotonic() + within_s
+    since = time.monotonic()
+    while (now := time.monotonic()) - since < quiet_s:
+        assert now < until, f"still changes: {last!r}"
+        if (found := value()) != last:
+            last, since = found, now
+        time.sleep(0.05)
+    return last
+
+
+def eventually(condition: Any, within_s: float = 60.0) -> Any:
     """The first true value of ``condition``; fails after ``within_s``."""
     until = time.monotonic() + within_s
     while not (value := condition()):

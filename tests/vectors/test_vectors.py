@@ -201,10 +201,16 @@ def test_a_client_that_leaves_out_a_step_of_the_page_is_noticed(changed: dict[st
     assert float(np.max(np.abs(np.subtract(got["u_V"], expected["u_V"])))) > 1e-6
 
 
-def test_payloads_without_an_answer_hold_the_values_of_the_table() -> None:
+def columns_of(name: str) -> dict[str, dict[str, list[float]]]:
+    """The values of a table by file and field."""
     read: dict[str, dict[str, list[float]]] = {}
-    for file, field, _, value in table("payloads.txt"):
+    for file, field, _, value in table(name):
         read.setdefault(file, {}).setdefault(field, []).append(float(value))
+    return read
+
+
+def test_payloads_without_an_answer_hold_the_values_of_the_table() -> None:
+    read = columns_of("payloads.txt")
     assert set(read) == {"samples.payload", "command.payload", "reference.payload"}
     for file, fields in read.items():
         got = page_client.decode_plain((FOLDER / file).read_bytes())
@@ -214,9 +220,7 @@ def test_payloads_without_an_answer_hold_the_values_of_the_table() -> None:
 
 
 def test_payloads_of_a_fleet_hold_the_values_of_the_table() -> None:
-    read: dict[str, dict[str, list[float]]] = {}
-    for file, field, _, value in table("fleet.txt"):
-        read.setdefault(file, {}).setdefault(field, []).append(float(value))
+    read = columns_of("fleet.txt")
     assert len(read) == 5
     for file, fields in read.items():
         data = (FOLDER / file).read_bytes()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,6 +13,7 @@ from dehyst.service.adapters.epics import EpicsAxis
 from dehyst.service.client.client import Client
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.runtime.session import open_client
+from tests.service.living import eventually
 
 pytestmark = pytest.mark.e2e
 p4p = pytest.importorskip("p4p.client.thread", reason="p4p is not installed (extra 'epics')")
@@ -25,7 +25,7 @@ def variables(serve: Callable[..., Any]) -> Iterator[tuple[Any, EpicsAxis, Any, 
     service = serve()
     with (
         open_client(service.endpoint) as session,
-        EpicsAxis(session, Keys("demo", "x"), "LAB:X", port=0, timeout_s=1.0) as axis,
+        EpicsAxis(session, Keys("demo", "x"), "LAB:X", port=0, timeout_s=3.0) as axis,
         Client.connect(service.endpoint) as client,
     ):
         port = axis.configuration["EPICS_PVAS_SERVER_PORT"]
@@ -53,12 +53,7 @@ def test_status_error_freeze_and_enable_are_variables(variables: Any) -> None:
     assert context.get("LAB:X:STATUS") == "frozen"
     context.put("LAB:X:FREEZE", False, timeout=5.0)
     assert not client.status()["frozen"]
-    for _ in range(100):
-        if seen[-1:] == ["ok"] and "frozen" in seen:
-            break
-        time.sleep(0.02)
-    assert seen[-1] == "ok"
-    assert "frozen" in seen
+    eventually(lambda: seen[-1:] == ["ok"] and "frozen" in seen)
     watching.close()
 
     context.put("LAB:X:ENABLE", False, timeout=5.0)
@@ -71,11 +66,9 @@ def test_status_error_freeze_and_enable_are_variables(variables: Any) -> None:
     y = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * k * 1e-3)
     for part in np.split(k, 30):
         client.samples(part, part * 1e-3, (y[part] - 1.0) / (11.0 * 0.95), y[part])
-    for _ in range(200):
-        if axis.poll() == "ok" and context.get("LAB:X:SAMPLE") == 2999 and context.get("LAB:X:MODEL_ERROR") > 0.0:
-            break
-        time.sleep(0.05)
-    assert context.get("LAB:X:SAMPLE") == 2999
+    eventually(
+        lambda: axis.poll() == "ok" and context.get("LAB:X:SAMPLE") == 2999 and context.get("LAB:X:MODEL_ERROR") > 0.0
+    )
     shown = context.get("LAB:X:MODEL_ERROR")
     assert float(shown) == pytest.approx(client.status()["quality"]["recent_rms_error_pct"], rel=0.5)
     assert shown.raw.display.units == "%"

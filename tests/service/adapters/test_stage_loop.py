@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +19,7 @@ from dehyst.service.client.client import Client
 from dehyst.service.protocol.samples import encode_command
 from dehyst.sim.recordings import ColumnMap, read
 from tests.service.conftest import Clock
+from tests.service.living import eventually
 
 
 @pytest.fixture(autouse=True)
@@ -200,21 +200,17 @@ def test_a_service_learns_from_an_adapter_and_its_voltages_are_applied(shared_se
     stage = PlainStage(1000.0, u_max_V=10.0)
     with Client.connect(shared_service.endpoint, axis="y", timeout_s=5.0) as client:
         loop = StageLoop(stage, client)
-        before = client.status()["samples"]
-        control = threading.Thread(target=loop.run, kwargs={"samples": 1000})
+        received = client.status()["samples"]["received"]
+        control = threading.Thread(target=loop.run, kwargs={"samples": 3000})
         control.start()
         y_um = 40.0 + 0.01 * np.arange(200)
-        answer = client.trajectory(y_um, begin=loop.first + 700)
-        client.command(loop.first + 700, answer.u_V)
+        answer = client.trajectory(y_um, begin=loop.first + 2500)
+        client.command(loop.first + 2500, answer.u_V)
         control.join()
-        for _ in range(100):
-            after = client.status()["samples"]
-            if after["received"] - before["received"] == loop.measured(0)[0].size:
-                break
-            time.sleep(0.02)
-    assert after["received"] - before["received"] == loop.measured(0)[0].size > 0
-    seq, u_V, _ = loop.measured(loop.first + 700)
+        assert loop.measured(0)[0].size > 0
+        eventually(lambda: client.status()["samples"]["received"] - received == loop.measured(0)[0].size)
+    seq, u_V, _ = loop.measured(loop.first + 2500)
     # The first ones are reached by the slew limit, from 0 V on.
-    applied = (seq >= loop.first + 710) & (seq < loop.first + 900)
+    applied = (seq >= loop.first + 2510) & (seq < loop.first + 2700)
     assert applied.any()
-    np.testing.assert_allclose(u_V[applied], answer.u_V[seq[applied] - loop.first - 700], atol=1e-9)
+    np.testing.assert_allclose(u_V[applied], answer.u_V[seq[applied] - loop.first - 2500], atol=1e-9)

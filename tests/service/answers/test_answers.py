@@ -29,7 +29,6 @@ from dehyst.service.protocol.query import (
     STALE,
     STAND_IN,
     FeedforwardQuery,
-    Trajectory,
 )
 from dehyst.service.server.axis import Axis
 from tests.service.conftest import DT_S, make_models
@@ -71,46 +70,8 @@ class Says:
         return {}
 
 
-class Counted(Says):
-    """Says what another says, and counts how often it was asked."""
-
-    def __init__(self, inner: Says) -> None:
-        super().__init__(inner.u_V, inner.std_V, inner.inside, inner.raises)
-        object.__setattr__(self, "asked", 0)
-
-    asked: int
-
-    def feedforward(self, y: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray) -> Feedforward:
-        object.__setattr__(self, "asked", self.asked + 1)
-        return super().feedforward(y, v, a, memory)
-
-
 def points(y: FloatArray, v: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     return y, np.full(y.size, v), np.zeros(y.size)
-
-
-def test_a_model_is_asked_once_and_its_answer_stands_where_nothing_speaks_against_it() -> None:
-    y, memory, rules = np.linspace(20.0, 30.0, 5), np.zeros(1), Rules(LIMITS)
-
-    def asked(model: Says, memory: FloatArray = memory, blends: bool = True) -> Trajectory:
-        counted = Counted(model)
-        got = answer_safely(counted, memory, points(y), 1.0, rules, LINE, blends)
-        assert counted.asked == 1
-        return got
-
-    good = asked(Says((1.0, 1.1, 1.2, 1.3, 9.9)))
-    assert (good.fallback, good.stand_in) == (False, "")
-    np.testing.assert_array_equal(good.u_V[:4], (1.0, 1.1, 1.2, 1.3))
-    assert good.flags[-1], "limited along the trajectory as ever"
-    for odd in (Says((math.nan,) * 5), Says((), raises=True)):
-        got = asked(odd)
-        assert got.fallback
-        assert (got.flags & NOT_FINITE_REPLACED).all()
-    # A model without bounds of its own answers outside its domain too, and says so.
-    assert (asked(Says((1.0,) * 5, inside=False)).flags & OUTSIDE_DOMAIN).all()
-    assert asked(Says((1.0,) * 5), np.full(1, math.inf)).fallback
-    alone = asked(Says((1.0,) * 5, inside=False), blends=False)
-    assert (alone.flags == OUTSIDE_DOMAIN).all()
 
 
 def test_outside_it_passes_smoothly_to_the_baseline_and_says_so() -> None:

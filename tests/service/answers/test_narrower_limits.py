@@ -13,44 +13,17 @@ import pytest
 
 from dehyst.service.answers.guard import Limits
 from dehyst.service.client.client import Client, Known
-from dehyst.service.client.follower import Follower
-from dehyst.service.config.settings import AxisConfig, read_config
+from dehyst.service.config.settings import read_config
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.protocol.model import encode_model
-from dehyst.service.protocol.query import Answer, FeedforwardQuery, Pending, Trajectory
-from dehyst.service.server.axis import Axis
+from dehyst.service.protocol.query import Answer, Pending, Trajectory
 from dehyst.service.server.process import Service
-from tests.service.conftest import DT_S, make_models, unused_port, write_config
+from tests.service.conftest import DT_S, unused_port, write_config
 from tests.service.living import Stage, eventually
 
 LEARNING = "lssvm_adaptive"
 #: 9 V were applied before; 5 V are allowed now, in steps of 0.1 V.
 LIMITS = Limits(0.0, 5.0, 100.0, -50.0, 150.0)
 RAMP_V = np.maximum(np.cumsum([9.0, *[-0.1] * 60])[1:], 5.0)
-
-
-def make_axis() -> Axis:
-    return Axis(AxisConfig("x", Path("x.npz"), LIMITS, served=LEARNING, learn=""), make_models(), None, LIMITS)
-
-
-def make_follower(axis: Axis) -> Follower:
-    model, seq, memory = axis.model(LEARNING)
-    payload = encode_model(LEARNING, model, seq, memory, axis.safety(LEARNING))
-    follower = Follower(SimpleNamespace(), None, LEARNING, lambda: payload, LIMITS)  # type: ignore[arg-type]
-    follower.resynchronise([0, 1], [9.0, 9.0], [89.0, 89.0])
-    return follower
-
-
-def test_point_trajectory_and_service_answer_from_outside_alike() -> None:
-    axis = make_axis()
-    y = np.full(60, 89.0)  # asks for 8 V
-    alone, blocks = make_follower(axis), make_follower(axis)
-    memory = alone.memory.copy()
-    points = np.array([alone.point(89.0) for _ in range(60)])
-    np.testing.assert_allclose(points, RAMP_V, atol=1e-12)
-    np.testing.assert_array_equal(blocks.trajectory(y, 0.0 * y, 0.0 * y)[0], points)
-    query = FeedforwardQuery(y, 0.0 * y, 0.0 * y, memory, LEARNING, u_before_V=9.0)
-    np.testing.assert_array_equal(axis.answer(query).u_V, points)
 
 
 def answer_of(*u_V: float) -> Trajectory:

@@ -33,6 +33,7 @@ from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE
 from dehyst.service.runtime.session import open_client, open_service
 from dehyst.service.security.authenticator import own_authenticator
+from tests.service.living import declared, eventually
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
@@ -96,9 +97,7 @@ def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -
     assert follower.refused == 0
     assert follower.age_s < 5.0
     # The publication of the last snapshot may still be on its way.
-    while follower.snapshot_seq < k - 20 and time.monotonic() < until:
-        time.sleep(0.01)
-    assert follower.snapshot_seq == k - 20
+    eventually(lambda: follower.snapshot_seq == k - 20)
     y = 40.0 + 3.0 * np.sin(np.arange(40) / 6.0)
     v, a = derivatives(y, None, None, client.dt_s)
     asked = client.trajectory(y, v, a, memory=follower.memory, as_of=follower.snapshot_seq)
@@ -151,9 +150,7 @@ def test_commands_leave_within_the_limits_and_say_so_and_references_arrive(clien
     client.reference(6, [3.0])
     flags = [client.command(100, [1.0, 9.0, 50.0]), client.command(103, [9.0]), client.command(110, [9.5])]
     assert [f.tolist() for f in flags] == [[0, LIMITED_SLEW, LIMITED_VOLTAGE | LIMITED_SLEW], [LIMITED_SLEW], [0]]
-    until = time.monotonic() + 5.0
-    while not (len(got) == 5 and wanted) and time.monotonic() < until:
-        time.sleep(0.01)
+    eventually(lambda: len(got) == 5 and wanted)
     assert got == pytest.approx([1.0, 3.0, 5.0, 7.0, 9.5])
     assert [(block.seq, block.values.tolist()) for block in wanted] == [(6, [3.0])]
     for subscriber in subscribers:
@@ -323,12 +320,10 @@ def test_no_command_of_a_burst_is_dropped(client: Client, shared_service: Any) -
         stage.declare_subscriber(
             client.keys.command, lambda s: seen.append(wire.decode_command(s.payload.to_bytes()).seq)
         )
-        time.sleep(0.2)
+        declared(stage, client._session)
         for burst in range(bursts):
             for i in range(each):
                 client.command(burst * each + i, [1.0])
             time.sleep(0.005)
-        until = time.monotonic() + 10.0
-        while len(seen) < bursts * each and time.monotonic() < until:
-            time.sleep(0.01)
+        eventually(lambda: len(seen) == bursts * each)
     assert seen == list(range(bursts * each))

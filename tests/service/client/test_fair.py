@@ -16,6 +16,7 @@ from dehyst.service.protocol.errors import BusyError, RefusedError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.query import encode_query
 from dehyst.service.runtime.session import open_client, open_service
+from tests.service.living import declared
 
 pytestmark = pytest.mark.e2e
 N = 40_000
@@ -94,14 +95,14 @@ def test_a_client_waits_as_long_as_it_is_told(free_port: int) -> None:
         def busy(query: Any) -> None:
             came.append(time.monotonic())
             with query:
-                query.reply_err(json.dumps({"error": "busy", "message": "later", "retry_after_s": 0.2}).encode())
+                query.reply_err(json.dumps({"error": "busy", "message": "later", "retry_after_s": 0.5}).encode())
 
         session.declare_queryable(keys.feedforward, busy)
-        with open_client(endpoint) as mine, Client(mine, keys, timeout_s=5.0, retry_s=0.5) as client:
+        with open_client(endpoint) as mine, Client(mine, keys, timeout_s=5.0, retry_s=2.0) as client:
             client._status = {"dt_s": 1e-3}
-            time.sleep(0.3)
+            declared(session, mine)
             with pytest.raises(BusyError) as refused:
                 client.point(40.0)
-    assert refused.value.retry_after_s == 0.2
-    assert len(came) == 3
-    assert min(np.diff(came)) >= 0.2
+    assert refused.value.retry_after_s == 0.5
+    assert 2 <= len(came) <= 4, "fewer on a busy machine"
+    assert min(np.diff(came)) >= 0.5

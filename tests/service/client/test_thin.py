@@ -152,10 +152,7 @@ COMMAND = "from dehyst.lab.cli import main\nsys.exit(main(sys.argv[1:]))"
 
 @pytest.mark.parametrize(
     ("arguments", "without", "package", "extras"),
-    [
-        (["stage"], "scipy", "scipy", "serve"),
-        (["demo"], "rerun", "rerun", "lab,viewer"),
-    ],
+    [(["stage"], "scipy", "scipy", "serve"), (["demo"], "rerun", "rerun", "lab,viewer")],
 )
 def test_a_command_says_what_to_install(arguments: list[str], without: str, package: str, extras: str) -> None:
     done = run_without((without,), COMMAND, *arguments)

@@ -11,12 +11,7 @@ from dehyst.adaptive.types import FloatArray, InverseModel
 from dehyst.service.answers.fallback import FADE_S
 from dehyst.service.client.client import Client, pending_before, with_pending
 from dehyst.service.protocol.errors import FieldError
-from dehyst.service.protocol.query import (
-    Answer,
-    FeedforwardQuery,
-    Pending,
-    Trajectory,
-)
+from dehyst.service.protocol.query import Answer, FeedforwardQuery, Pending, Trajectory
 from tests.service.server.test_axis import make_axis, parts, recording
 
 

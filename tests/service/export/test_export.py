@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -149,10 +148,7 @@ def test_what_a_running_service_has_learnt_is_exported(
         for at in range(0, n, 50):
             part = slice(at, at + 50)
             client.samples(k[part], k[part] * DT_S, u[part], 0.94 * (11.0 * u[part] + 1.0))
-            time.sleep(0.01)
-        until = time.monotonic() + 60.0
-        while client.status()["seq"] < n - 1 and time.monotonic() < until:
-            time.sleep(0.05)
+            client.wait_learnt(at + 49)
         words = ["export", "--from-service", key, "--endpoint", service.endpoint, "--model", "lssvm_adaptive"]
         assert main([*words, "--out", str(out)]) == 0, capsys.readouterr().err
         told = re.search(rf"lssvm_adaptive of {key} after sample (\d+)", capsys.readouterr().out)

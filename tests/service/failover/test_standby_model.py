@@ -13,12 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dehyst.adaptive.errors import ModelFileError
-from dehyst.service.failover.standby_model import (
-    NOT_SYNCED,
-    StandbyModel,
-    newer_than,
-    standby_folder,
-)
+from dehyst.service.failover.standby_model import NOT_SYNCED, StandbyModel, newer_than, standby_folder
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.server.axis import Axis
 from dehyst.service.server.axis_loop import AxisLoop

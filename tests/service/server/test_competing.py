@@ -17,13 +17,7 @@ from dehyst.adaptive.tuning.config import RetuneConfig
 from dehyst.adaptive.types import FloatArray, Hyperparameters, InverseModel
 from dehyst.baselines import fit_linear, fit_mpi
 from dehyst.service.answers.guard import Limits
-from dehyst.service.background.adoptions import (
-    ADOPTIONS_FILE,
-    Adoptions,
-    Retuned,
-    append_adoption,
-    read_adoptions,
-)
+from dehyst.service.background.adoptions import ADOPTIONS_FILE, Adoptions, Retuned, append_adoption, read_adoptions
 from dehyst.service.background.retuner import Retuner
 from dehyst.service.background.retuning_worker import start_job
 from dehyst.service.background.settings import RetuningConfig
@@ -303,7 +297,6 @@ def test_a_bad_adoption_is_refused_by_the_learner_and_changes_nothing(
 
 
 @pytest.mark.parametrize("retuner", [{"timeout_s": 0.05}], indirect=True)
-@pytest.mark.alone
 def test_what_takes_too_long_is_ended_and_counted(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
@@ -319,7 +312,6 @@ def test_what_takes_too_long_is_ended_and_counted(
 
 
 @pytest.mark.parametrize("retuner", [{"period_s": 1.0, "fresh": 200}], indirect=True)
-@pytest.mark.alone
 def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,26 +10,16 @@ import numpy as np
 import pytest
 
 from dehyst.adaptive.types import InverseModel
-from dehyst.service.answers.guard import Limits
 from dehyst.service.client.follower import Follower
-from dehyst.service.config.settings import AxisConfig
 from dehyst.service.protocol.model import decode_model
 from dehyst.service.protocol.query import FeedforwardQuery
 from dehyst.service.protocol.samples import DELTA, MODEL, SampleBatch
 from dehyst.service.server.axis import Axis
-from dehyst.service.server.axis_loading import load_axis, make_learner
 from dehyst.service.server.deltas import DeltaStreams
 from dehyst.service.server.moves import WHOLE_S
-from dehyst.service.storage.model_file import Bundle, BundleMeta
+from tests.service.server.test_axis import LIMITS, make_axis
 
 DT_S = 1e-3
-LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
-META = BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0)
-
-
-def make_axis(models: dict[str, InverseModel], compete: tuple[str, ...]) -> Axis:
-    config = AxisConfig("x", Path("x.npz"), LIMITS, compete=compete)
-    return load_axis("demo", config, make_learner, Bundle(models, META))
 
 
 def batches(n: int, size: int = 5, jump_at: int = 1500) -> Iterator[SampleBatch]:
@@ -82,7 +71,7 @@ QUESTION = FeedforwardQuery(40.0 + 0.1 * np.arange(30), np.full(30, 100.0), np.z
 def test_a_follower_is_at_the_last_batch_and_near_the_newest_snapshot(
     models: dict[str, InverseModel], name: str, compete: tuple[str, ...]
 ) -> None:
-    axis = make_axis(models, compete)
+    axis = make_axis(models, compete=compete)
     wire = Wire(axis, name)
     follower = wire.follower
     small, seen, off_V, volts, whole = [], [], [], [], 0
@@ -109,7 +98,7 @@ def test_a_follower_is_at_the_last_batch_and_near_the_newest_snapshot(
 
 
 def test_a_whole_model_is_the_snapshot_that_queries_are_answered_from(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models, ())
+    axis = make_axis(models)
     wire = Wire(axis, "lssvm_adaptive")
     wholes = 0
     for batch in batches(1001, 1):
@@ -121,7 +110,7 @@ def test_a_whole_model_is_the_snapshot_that_queries_are_answered_from(models: di
 
 
 def test_what_an_operator_changes_is_sent_whole_within_a_tenth_of_a_second(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models, ())
+    axis = make_axis(models)
     wire = Wire(axis, "lssvm_adaptive")
     for batch in batches(500):
         wire.learn(batch)
@@ -148,7 +137,7 @@ def test_the_last_message_is_sent_once_more_where_none_follows(models: dict[str,
 
 
 def test_what_is_learnt_and_answered_does_not_depend_on_who_follows(models: dict[str, InverseModel]) -> None:
-    followed, alone = make_axis(models, ("linear",)), make_axis(models, ("linear",))
+    followed, alone = make_axis(models, compete=("linear",)), make_axis(models, compete=("linear",))
     wire = Wire(followed, "auto")
     for batch in batches(1700):
         followed.handle(batch)

@@ -69,33 +69,37 @@ def batches(seed: int, n: int) -> list[SampleBatch]:
     ]
 
 
+def outrun(axis_loop: Make, monkeypatch: pytest.MonkeyPatch) -> AxisLoop:
+    """A loop that is not started, for a stage that is faster than it: 50 samples at a time, 0.1 s each."""
+    monkeypatch.setattr("dehyst.service.intake.sample_queue.MOST_TOGETHER", 50)
+    now_s = iter(0.1 * k for k in range(10_000))
+    monkeypatch.setattr("dehyst.service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
+    return axis_loop(META, queue_samples=300)
+
+
+def offer(loop: AxisLoop, batch: SampleBatch, number: int) -> None:
+    """Offer a message; what waits is handled with every fourth."""
+    loop.offer(batch)
+    if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
+        loop.take(item)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_received_is_what_was_learnt_refused_thinned_and_dropped(
     axis_loop: Make, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loop = axis_loop(META, queue_samples=300)
-    sent = 0
-    monkeypatch.setattr("dehyst.service.intake.sample_queue.MOST_TOGETHER", 50)
-    now_s = iter(0.1 * k for k in range(10_000))
-    monkeypatch.setattr("dehyst.service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
-    for number, batch in enumerate(batches(seed, 4000)):
-        # The stage is faster than the learner, which takes some samples now and then.
-        loop.offer(batch)
-        sent += len(batch)
-        if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
-            loop.handle(item.batch)
-            loop.queue.finish(item, handled=True)
+    loop, sent = outrun(axis_loop, monkeypatch), batches(seed, 4000)
     # A message longer than the queue is dropped whole.
     k = np.arange(5000, 15_000)
-    loop.offer(SampleBatch(k, k * DT_S, np.full(k.size, 4.0), np.full(k.size, 45.0)))
-    sent += k.size
+    sent.append(SampleBatch(k, k * DT_S, np.full(k.size, 4.0), np.full(k.size, 45.0)))
+    for number, batch in enumerate(sent):
+        offer(loop, batch, number)
     loop.start()
     loop.close()
     samples = axis_fields(loop)["samples"]
-    assert samples["received"] == sent
-    assert samples["thinned"] > 0
-    assert samples["dropped"] > 0
-    assert sum(samples["gates"].values()) + samples["thinned"] + samples["dropped"] == sent
+    assert samples["received"] == sum(map(len, sent))
+    assert min(samples["thinned"], samples["dropped"]) > 0
+    assert sum(samples["gates"].values()) + samples["thinned"] + samples["dropped"] == samples["received"]
     assert samples["lost"] >= 0
 
 
@@ -103,19 +107,13 @@ def test_numbers_handled_add_up_at_every_moment_while_samples_are_left_out(
     axis_loop: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is left out counts at once, its numbers are passed when those before it have been handled."""
-    loop = axis_loop(META, queue_samples=300)
-    monkeypatch.setattr("dehyst.service.intake.sample_queue.MOST_TOGETHER", 50)
-    now_s = iter(0.1 * k for k in range(10_000))
-    monkeypatch.setattr("dehyst.service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
-    rng = np.random.default_rng(0)
-    seq = np.arange(4000)
+    loop, rng, seq = outrun(axis_loop, monkeypatch), np.random.default_rng(0), np.arange(4000)
     # The network loses some, of which no notice must be lost either.
     seq = seq[(rng.random(seq.size) > 0.02) | (seq < 10)]
-    for number, part in enumerate(np.array_split(seq, 160)):
-        y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * part * DT_S)
-        loop.offer(SampleBatch(part, part * DT_S, (y_um - 1.0) / 11.0, y_um))
-        if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
-            loop.take(item)
+    y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * seq * DT_S)
+    columns = (np.array_split(column, 160) for column in (seq, seq * DT_S, (y_um - 1.0) / 11.0, y_um))
+    for number, part in enumerate(zip(*columns, strict=True)):
+        offer(loop, SampleBatch(*part), number)
         status = axis_fields(loop)
         s = status["samples"]
         handled = s["received"] - s["thinned"] - s["dropped"]
@@ -123,9 +121,7 @@ def test_numbers_handled_add_up_at_every_moment_while_samples_are_left_out(
         missing = status["seq"] + 1 - int(np.count_nonzero(seq <= status["seq"]))
         # A number that the network lost beside those left out may be told from them a message later.
         assert abs(s["lost"] - missing) <= 50
-    assert s["thinned"] > 0
-    assert s["dropped"] > 0
-    assert s["left_out"] > 500
+    assert min(s["thinned"], s["dropped"], s["left_out"] - 500) > 0
 
 
 def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.0) -> Health:

@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from dehyst.adaptive.types import InverseModel
+from dehyst.lab.cli import main
 from dehyst.service.client.client import Client
 from dehyst.service.protocol import samples as wire
 from dehyst.service.protocol.errors import NoReplyError
@@ -29,12 +30,6 @@ from tests.service.living import eventually, samples
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
-
-
-def dehyst(*args: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "dehyst.lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
-    )
 
 
 def test_it_serves_learns_publishes_and_goes(serve: Callable[..., Any], tmp_path: Path) -> None:
@@ -124,10 +119,7 @@ def test_bad_input_gets_an_error_reply_and_the_service_lives_on(serve: Callable[
 
 def test_several_axes_are_served_apart(shared_service: Any) -> None:
     endpoint = shared_service.endpoint
-    with (
-        Client.connect(endpoint, axis="x", timeout_s=5.0) as x,
-        Client.connect(endpoint, axis="y", timeout_s=5.0) as y,
-    ):
+    with Client.connect(endpoint, axis="x", timeout_s=5.0) as x, Client.connect(endpoint, axis="y", timeout_s=5.0) as y:
         y._session.put(y.keys.sample, samples(0, 500))
         eventually(lambda: y.status()["seq"] == 499)
         assert x.status()["seq"] == -1
@@ -137,38 +129,25 @@ def test_several_axes_are_served_apart(shared_service: Any) -> None:
 
 
 def test_what_cannot_be_served_ends_with_a_message(
-    shared_service: Any, models: dict[str, InverseModel], tmp_path: Path
+    shared_service: Any, models: dict[str, InverseModel], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     base = f'stage = "demo"\nlisten = ["{shared_service.endpoint}"]\n[[axis]]\nname = "x"\nmodel = "x.npz"\n'
     limits = "u_min_V = 0\nu_max_V = 10\nslew_V_per_s = 2000\n"
     config = tmp_path / "serve.toml"
-    config.write_text(base + limits + "speed = 3\n")
+
+    def refused(text: str) -> str:
+        config.write_text(text)
+        assert main(["serve", "--config", str(config)]) == 2
+        return capsys.readouterr().err
+
     np.savez(tmp_path / "x.npz", y=np.zeros(3))
-    unknown = dehyst("serve", "--config", str(config))
-    config.write_text(base + limits)
-    foreign = dehyst("serve", "--config", str(config))
-    config.write_text(base + limits + 'learn = ""\nserved = "linear"\n')
+    assert "speed" in refused(base + limits + "speed = 3\n")
+    assert "not a model bundle" in refused(base + limits)
     write_bundle(tmp_path / "x.npz", {"linear": models["linear"]}, BundleMeta("demo", "x", DT_S))
-    taken = dehyst("serve", "--config", str(config))
-    config.write_text(base.replace("127.0.0.1", "0.0.0.0") + limits)
-    remote = dehyst("serve", "--config", str(config))
-    for ended, words in (
-        (unknown, "speed"),
-        (foreign, "not a model bundle"),
-        (taken, "port is in use"),
-        (remote, "beyond_loopback"),
-        (dehyst("serve"), "--example"),
-    ):
-        assert ended.returncode == 2
-        assert words in ended.stderr
-        assert "Traceback" not in ended.stderr
-
-
-def test_the_example_is_printed_and_help_names_units() -> None:
-    example = dehyst("serve", "--example")
-    assert example.returncode == 0
-    assert "slew_V_per_s" in example.stdout
-    assert "µm" in dehyst("query", "--help").stdout
+    assert "port is in use" in refused(base + limits + 'learn = ""\nserved = "linear"\n')
+    assert "beyond_loopback" in refused(base.replace("127.0.0.1", "0.0.0.0") + limits)
+    assert main(["serve"]) == 2
+    assert "--example" in capsys.readouterr().err
 
 
 def test_the_serving_process_imports_neither_torch_nor_plots_nor_a_diagnosis() -> None:
@@ -226,29 +205,29 @@ def _sockets(pid: int) -> set[str]:
 
 
 @pytest.mark.e2e
-def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: Callable[..., Any]) -> None:
+def test_samples_that_come_and_are_lost_are_a_trouble(serve: Callable[..., Any]) -> None:
     process = serve(extra="queue_samples = 60\n")
-    with Client.connect(process.endpoint, axis="x", timeout_s=2.0) as client, open_client(process.endpoint) as stage:
+    with Client.connect(process.endpoint, axis="x", timeout_s=5.0) as client, open_client(process.endpoint) as stage:
 
-        def trouble_of(first: int, n: int, step: int) -> str:
-            """The first trouble while messages of n samples from ``first`` on come for three seconds."""
-            until, at = time.monotonic() + 3.0, first
-            while time.monotonic() < until:
+        def trouble_of(first: int, n: int, step: int, messages: int) -> str:
+            """The first trouble while so many messages of n samples from ``first`` on come, 50 a second."""
+            for at in range(first, first + messages * step, step) if step else range(messages):
                 stage.put(client.keys.sample, samples(at, n) if n else b"rubbish")
-                at += step
                 time.sleep(0.02)
-                if (name := client.status()["trouble"]) and time.monotonic() > until - 2.9:
-                    return str(name)
+                # The next one when this one is handled: on a busy machine more than fit would wait.
+                status = eventually(lambda: (s := client.status())["samples"]["waiting"] == 0 and s)
+                if status["trouble"]:
+                    return str(status["trouble"])
             return ""
 
-        assert trouble_of(0, 20, 20) == ""
-        for name, lost in (
-            ("samples_dropped", lambda: trouble_of(10_000, 100, 100)),
-            ("samples_malformed", lambda: trouble_of(0, 0, 0)),
-            ("samples_lost", lambda: trouble_of(30_000, 10, 20)),
+        assert trouble_of(0, 20, 20, 150) == ""
+        for name, first, n, step in (
+            ("samples_dropped", 10_000, 100, 100),
+            ("samples_malformed", 0, 0, 0),
+            ("samples_lost", 30_000, 10, 20),
         ):
-            assert lost() == name
-            eventually(lambda: client.status()["trouble"] == "", 5.0)
+            assert trouble_of(first, n, step, 1000) == name
+            eventually(lambda: client.status()["trouble"] == "")
 
 
 def test_a_stranger_cannot_say_what_was_commanded(serve: Callable[..., Any]) -> None:
@@ -294,10 +273,10 @@ def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) 
                 u_V, y_um = answer.u_V, 1.0 + 10.45 * answer.u_V
                 put.put(wire.encode_samples(k, k * DT_S, *((y_um, u_V) if exchanged else (u_V, y_um))))
                 begin += n
-                time.sleep(0.004)
+                client.wait_learnt(begin - 1)
 
         def handled() -> dict[str, Any]:
-            return eventually(lambda: (status := client.status())["seq"] == begin - 1 and status)
+            return client.status()
 
         play(2.0, exchanged=False)
         assert handled()["trouble"] == ""
@@ -310,8 +289,8 @@ def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) 
         play(1.0, exchanged=False)
         good = handled()
         assert good["trouble"] == ""
-        # The voltages went on all the while: the stage is within 2 % of its range of where it was wanted. (On a busy
-        # machine the learner has seen fewer samples; what is exchanged and believed costs 9 to 15 %.)
+        # The voltages went on all the while: the stage is within 2 % of its range of where it was wanted; what is
+        # exchanged and believed costs 9 to 15 %.
         for said in (before, answer):
             k = np.arange(begin - n - (0 if said is answer else 1000), begin - (0 if said is answer else 1000))
             wanted_um = 45.0 + 30.0 * np.sin(2.0 * np.pi * 2.0 * k * DT_S)

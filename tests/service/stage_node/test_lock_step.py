@@ -47,12 +47,11 @@ def test_a_controller_that_stalls_is_waited_for_in_lock_step_alone(
 
             samples = session.declare_subscriber(Keys("t", "x").sample, take)
             commands = session.declare_publisher(Keys("t", "x").command, congestion_control=SURELY)
-            time.sleep(0.3)
-            assert wait_followed(commands, 10.0)
+            assert wait_followed(commands, 20.0)
             for first in range(0, n, block):
                 with moved:
                     # Of the block before: the last samples fill no message of seven, and come for all that.
-                    assert moved.wait_for(lambda due=first - 1: seen[0] >= due, 10.0)  # type: ignore[misc]
+                    assert moved.wait_for(lambda due=first - 1: seen[0] >= due, 30.0)  # type: ignore[misc]
                 if first == n // 2:
                     time.sleep(PAUSE_S)
                 commands.put(wire.encode_command(first, np.full(block, first / n)))

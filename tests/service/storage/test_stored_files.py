@@ -290,6 +290,12 @@ def test_models_come_back_and_answer_the_same(models: dict[str, InverseModel], t
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
 
 
+WRONG_META = (
+    ("y_min_um", "low"), ("y_min_um", 10**400), ("stage", 7), ("notes", 3), ("notes", ["clipped"]), ("dt_s", 10**400),
+    ("magic", []),
+)  # fmt: skip
+
+
 def rewritten(path: Path, **changes: Any) -> Path:
     """The file with fields of its header changed."""
     with np.load(path) as file:
@@ -313,6 +319,11 @@ def rewritten(path: Path, **changes: Any) -> Path:
         ({"models": {"a": {"kind": "linear", "values": {}, "arrays": []}}}, "model 'a'"),
         ({"models": {"a": {"kind": "linear", "values": {}, "arrays": ["gone"]}}}, "incomplete"),
         ({"models": {"a": 5}}, "incomplete"),
+        ({"models": {"a": {"kind": "lssvm", "values": [1], "arrays": []}}}, "m.npz"),
+        ({"models": {"a": {"kind": "lssvm", "values": {}, "arrays": [["x"]]}}}, "m.npz"),
+        ({"models": {"linear": {"kind": "linear", "values": {"dt_s": 10**400}, "arrays": []}}}, "m.npz"),
+        ({"models": {"a": {"kind": "champion", "values": {"names": 3, "kinds": {}}, "arrays": []}}}, "m.npz"),
+        *(({name: value}, "m.npz") for name, value in WRONG_META),
     ],
 )
 def test_another_version_or_a_foreign_file_is_refused(
@@ -320,7 +331,7 @@ def test_another_version_or_a_foreign_file_is_refused(
 ) -> None:
     path = tmp_path / "m.npz"
     write_bundle(path, models, META)
-    with pytest.raises(ModelFileError, match=words) as refused:
+    with pytest.raises((ModelFileError, InputError), match=words) as refused:
         read_bundle(rewritten(path, **changes))
     assert str(path) in str(refused.value)
 
