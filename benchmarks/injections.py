@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measured import Source, data_folder
+from benchmarks.measured import Source, data_folder, multisine
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim.diagnosis import diagnose_prepared, prepare
@@ -32,7 +32,7 @@ from tests.foreign.inject import ACCEPTED, beyond, inject, lagged
 class Record:
     """A part of a measured file, s. ``floor_um``: RMS that a diagnosis leaves of it untouched.
 
-    nominal : the stage that it is compared with. others : channel and realisation of further drives.
+    nominal : the stage that it is compared with. others : of further drives.
     """
 
     source: Source
@@ -40,12 +40,13 @@ class Record:
     end_s: float
     floor_um: float
     nominal: str = "bouc_wen"
-    others: tuple[tuple[int, int], ...] = ()
+    others: tuple[Source, ...] = ()
 
     def read(self, folder: Path) -> tuple[float, FloatArray, FloatArray, list[FloatArray]]:
         """Sample time (s), voltage, displacement and voltages of other drives, (n,) each; gaps are filled."""
-        dt_s, u, y = self.source.read(folder)
-        more = [Source(self.source.path, "u", "u", at).read(folder)[1] for at in self.others]
+        whole = self.source.read(folder)
+        dt_s, u, y = whole.dt_s, whole.u_V, whole.y_um
+        more = [source.read(folder).u_V for source in self.others]
         part = slice(round(self.begin_s / dt_s), round(self.end_s / dt_s))
         u, y = (_filled(column[part]) for column in (u, y))
         return dt_s, u, y, [column[part] for column in more]
@@ -57,9 +58,8 @@ def _filled(x: FloatArray) -> FloatArray:
 
 
 def _mirror(level: int, channel: int, floor_um: float) -> Record:
-    others = [c for c in range(3) if c != channel]
-    source = Source(f"fine_steering_mirror/fsm_{level}mV_train.npz", "u", "y_um", (channel, 0))
-    return Record(source, 0.0, 2.56, floor_um, "linear", ((others[0], 0), (others[1], 0)))
+    source, *others = (multisine(f"{level}mV_train", c, 0) for c in sorted(range(3), key=lambda c: c != channel))
+    return Record(source, 0.0, 2.56, floor_um, "linear", tuple(others))
 
 
 _SINE, _RAMPED = Source("picma_stack/model_sine_1hz.csv"), Source("picma_stack/test_ramped_sine_ff.csv")

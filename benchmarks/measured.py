@@ -78,7 +78,7 @@ class Record:
     test: Source | None = None
 
 
-def _multisine(file: str, channel: int, realisation: int) -> Source:
+def multisine(file: str, channel: int, realisation: int) -> Source:
     """One channel and realisation, whose periods follow each other."""
     index = dict.fromkeys(("u", "y"), f":,{channel},{realisation},*")
     mapping = ColumnMap(columns={"u": "u", "rate": "fs_hz"}, units={"u": "V", "rate": "Hz"}, index=index)
@@ -88,7 +88,7 @@ def _multisine(file: str, channel: int, realisation: int) -> Source:
 def _mirror(level: int, channel: int) -> Record:
     # There is no test file of the largest amplitude.
     other, realisation = ("train", 1) if level == 300 else ("test", 0)
-    train, test = _multisine(f"{level}mV_train", channel, 0), _multisine(f"{level}mV_{other}", channel, realisation)
+    train, test = multisine(f"{level}mV_train", channel, 0), multisine(f"{level}mV_{other}", channel, realisation)
     return Record(f"mirror {level} mV, {channel}", train, (0.0, math.inf), (0.0, math.inf), test)
 
 

@@ -25,7 +25,7 @@ Errors are in percent of the commanded range. Exit status 1 if a run ends at a v
 than 0.1 s, or follows a wrong sensor.
 
   dehyst rehearse --plant examples/plant.py:Stage
-  dehyst rehearse --plant out/diagnosis/stage.toml --events none,gain_at_once
+  dehyst rehearse --plant mystage.toml --events none,gain_at_once
   dehyst rehearse --plant mine.py:run --rate 1000 --u-min 0 --u-max 100 --events none,knock,gain_at_once
 """
 

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from dehyst.adaptive.errors import InputError
+from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.errors import FieldError
 from dehyst.service.protocol.keys import Keys
 from dehyst.service.protocol.samples import MAX_SEQ

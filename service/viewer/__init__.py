@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from dehyst.adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from dehyst.service.viewer.computed_run import write_recording as write_recording
     from dehyst.service.viewer.records import Event as Event
     from dehyst.service.viewer.records import SceneConfig as SceneConfig
     from dehyst.service.viewer.records import Tracking as Tracking
-    from dehyst.service.viewer.rerun_sink import write_recording as write_recording
 
 __getattr__ = lazy_names(__name__)

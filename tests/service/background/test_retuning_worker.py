@@ -140,7 +140,8 @@ def test_the_thread_that_learns_only_copies(
             retuner.step(axis)
             states.append(retuner.status()["state"])
     # All of its states were gone through: what follows is no measurement of doing nothing.
-    assert list(dict.fromkeys(states)) == ["proposing", "waiting for fresh samples", "trying"]
+    assert list(dict.fromkeys(states)) == ["waiting for fresh samples", "trying"]
+    assert retuner.status()["proposed"] == 1
     assert (Working.made, retuner.status()["started"]) == (2, 1)
     # The window is looked at every quarter of a second of samples at most, and not at all while others work.
     waited = states.count("waiting for fresh samples") * BLOCK

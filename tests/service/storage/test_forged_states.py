@@ -106,7 +106,8 @@ def test_no_motion_and_no_voltage_beyond_all_measure_is_taken() -> None:
     states = [state for alone, state in Victims().states.values() if alone]
     seen = set()
     for row in rows(Parts):
-        if not {"µm", "V"} & {unit.partition("/")[0] for unit in row.unit.split(", ")}:
+        about = row.meaning.rpartition("[")[2].rstrip("]")
+        if not {"µm", "V"} & {word.partition("/")[0] for word in about.split(", ")}:
             continue
         name = "learner." + row.name
         state = next((state for state in states if np.size(state.get(name, ()))), None)

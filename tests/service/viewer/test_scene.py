@@ -17,10 +17,10 @@ from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.protocol.samples import SampleBatch
 from dehyst.service.viewer import style
+from dehyst.service.viewer.computed_run import cut, in_order
 from dehyst.service.viewer.consumer import ReferenceRing, Unit
 from dehyst.service.viewer.plane import HEIGHT, WIDTH, Plane
 from dehyst.service.viewer.records import Diagnostics, Event, IntArray, SceneConfig, Tracking
-from dehyst.service.viewer.rerun_sink import cut, in_order
 from dehyst.service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")

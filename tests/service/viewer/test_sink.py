@@ -18,9 +18,9 @@ import pytest
 from dehyst.adaptive.errors import InputError
 from dehyst.adaptive.types import FloatArray
 from dehyst.service.viewer import style
+from dehyst.service.viewer.computed_run import write_recording
 from dehyst.service.viewer.output import Output, OutputConfig
 from dehyst.service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
-from dehyst.service.viewer.rerun_sink import write_recording
 from tests.service.conftest import unused_port
 from tests.service.living import eventually
 
