@@ -29,6 +29,8 @@ from tests.service.living import Asker, Process, Stage, eventually, samples
 pytestmark = pytest.mark.e2e
 ROOT = Path(__file__).resolve().parents[3]
 EXTRA = 'recorder = "rec"\ncheckpoints = "kept"\ncheckpoint_s = 0.5\nstale_s = 0.4\nserved = "lssvm_adaptive"\n'
+#: A learner that takes seconds for thousands of samples.
+SLOW = "[axis.learner]\nwindow = 1500\nlearn_every = 2\n"
 #: Loaded before anything else: a clock of the wall that stands a day earlier and runs backwards.
 BACKWARDS = "import time\n_now = time.time\n_start = _now()\ntime.time = lambda: 2 * _start - _now() - 86400.0\n"
 
@@ -174,7 +176,7 @@ def test_what_waits_at_a_stop_is_recorded_and_learnt_by_the_next_start(
     tmp_path: Path, processes: list[Process]
 ) -> None:
     """A stop used to learn for two seconds, and what was left went where no start reads it."""
-    config = write_config(tmp_path, port := unused_port(), extra=EXTRA)
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA + SLOW)
     endpoint = f"tcp/127.0.0.1:{port}"
     serve = ("serve", "--config", str(config))
     processes.append(Process(*serve))
