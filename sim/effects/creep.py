@@ -8,11 +8,10 @@ in closed form.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from dehyst.adaptive.types import FloatArray
 from dehyst.sim import pictures
@@ -63,28 +62,18 @@ _POLES = LastResultCache()
 class Creep(CauseModel):
     """A sum of slow first-order lags, 0.05 s to beyond the record, 0.6 decades apart.
 
-    Equal weights give log t; a line of weights over log tau is close to a power of t, and a parabola closer. With a
-    weight of its own a fast lag would stand for a lag of the stage or for a part of the loop.
+    Equal weights give log t; a line of weights over log tau is close to a power of t. With a weight of its own a fast
+    lag would stand for a lag of the stage or for a part of the loop.
     """
 
     unseen_is_absent: bool = True
     imitates_others: bool = True
     model_error: float = 0.04
     spacing: float = 0.6  # decades between the poles
-    #: Numbers of the weights: 2 for a line, 3 for a parabola.
-    terms: int = 2
 
     def weights(self, p: FloatArray, data: FitData) -> FloatArray:
         """(m,) weight of each lag."""
-        return np.asarray(p[: self.terms] @ self._shapes(data))
-
-    def _shapes(self, data: FitData) -> FloatArray:
-        """(terms, m) weights of each lag for a unit of each number."""
-        return np.asarray(legvander(np.linspace(-1.0, 1.0, self.taus_s(data).size), self.terms - 1).T)
-
-    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
-        finer = left_floors > 1.1 and self.terms == 2
-        return (replace(self, terms=3), [np.insert(p, 2, 0.0)]) if finer else None
+        return np.asarray(p[0] + p[1] * np.linspace(-1.0, 1.0, self.taus_s(data).size))
 
     def taus_s(self, data: FitData) -> FloatArray:
         top = data.slowest_s
@@ -104,20 +93,17 @@ class Creep(CauseModel):
         long_um = 0.0 if data.begins_at_rest else r
         return (
             ModelParameter("weight", "1", 0.0, 0.0, 0.1, 0.005, ActsOn.MOTION, True),
-            *(
-                ModelParameter(name, "1", 0.0, -0.1, 0.1, 0.005, ActsOn.MOTION, True)
-                for name in ("weight_tilt", "weight_bend")[: self.terms - 1]
-            ),
+            ModelParameter("weight_tilt", "1", 0.0, -0.1, 0.1, 0.005, ActsOn.MOTION, True),
             ModelParameter("start_um", "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION),
             ModelParameter("before_um", "µm", 0.0, -long_um, long_um, 0.05 * r, ActsOn.MOTION),
         )
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        return [trial[: self.terms] for trial in super().guesses(data, residual_um)]
+        return [trial[:2] for trial in super().guesses(data, residual_um)]
 
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         taus = self.taus_s(data)
-        weights, starts = self.weights(p, data), p[self.terms :]
+        weights, starts = self.weights(p, data), p[2:]
         if not np.any(weights):
             return x_um
         rates = data.dt_s / taus
@@ -136,7 +122,7 @@ class Creep(CauseModel):
         rise = 1.0 - np.exp(-t[None, :] / taus[:, None])
         x = np.log10(t) - np.log10(t).mean()
         each = rise @ x / float(x @ x)
-        row = np.append(self._shapes(data) @ each, np.zeros(p.size - self.terms))
+        row = np.array([each.sum(), each @ np.linspace(-1.0, 1.0, taus.size), *np.zeros(p.size - 2)])
         return {"gain_per_decade": (float(row @ p), row)}
 
 
