@@ -133,7 +133,8 @@ class EpicsAxis:
         raise ServiceError(f"{self._keys.base}: no reply within {self._timeout_s:g} s; is the service running?")
 
     def _post(self, name: str, value: Any, severity: int, message: str) -> None:
-        self._variables[name].post(value, timestamp=time.time(), severity=severity, message=message[:80])
+        now_unix_s = time.time()
+        self._variables[name].post(value, timestamp=now_unix_s, severity=severity, message=message[:80])
 
     def _freeze(self, on: bool) -> None:
         operate(self._session, self._keys, "freeze" if on else "thaw", "epics", None, self._timeout_s, self._by)

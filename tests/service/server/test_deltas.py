@@ -122,7 +122,7 @@ def test_what_an_operator_changes_is_sent_whole_within_a_tenth_of_a_second(model
 
 def test_the_last_message_is_sent_once_more_where_none_follows(models: dict[str, InverseModel]) -> None:
     """Zenoh may drop it on the way, and the stage may rest from then on."""
-    axis = make_axis(models, ())
+    axis = make_axis(models, compete=())
     wire = Wire(axis, "lssvm_adaptive")
     *learnt, last = batches(500)
     for batch in learnt:
