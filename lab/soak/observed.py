@@ -405,9 +405,10 @@ def _time(row: Any) -> float:
 
 
 def troubles_since(events: Sequence[dict[str, Any]], first: int) -> list[tuple[int, str]]:
-    """(sample number, name) of the troubles in ``events`` from sample ``first`` on, oldest first."""
-    told = [event for event in events if event.get("event") == "trouble" and int(event.get("seq", -1)) >= first]
-    return [(int(event["seq"]), _trouble(event)) for event in told]
+    """(sample number, name) of the troubles in ``events`` that stand at sample ``first`` or come later."""
+    told = [event for event in events if event.get("event") in ("trouble", "recovered")]
+    at = sum(int(event.get("seq", -1)) < first for event in told)
+    return [(int(e["seq"]), _trouble(e)) for e in told[max(at - 1, 0) :] if e["event"] == "trouble"]
 
 
 def _trouble(event: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dehyst.lab.soak.observed import troubles_since
 from dehyst.service.stage_node.faults import Fault, Injector
 
 Y_UM = 40.0 + 10.0 * np.sin(0.05 * np.arange(400))
@@ -56,3 +57,12 @@ def test_a_lying_sensor_goes_on_from_its_last_reading_and_is_sound_before_and_af
         assert np.unique(lie).size == 200, "no two readings are equal"
     else:
         np.testing.assert_allclose(lie, (0.3 if kind == "sensor_gain" else -1.0) * moved, atol=1e-12)
+
+
+def test_a_trouble_that_stands_when_a_fault_begins_names_it_too() -> None:
+    """It is told once, when it begins: before the fault, where late voltages have made it."""
+    names = (("trouble", 90), ("recovered", 120), ("trouble", 300))
+    events = [{"event": name, "seq": seq, "detail": "voltage_differs (why)"} for name, seq in names]
+    assert [seq for seq, _ in troubles_since(events, 100)] == [90, 300]
+    assert [seq for seq, _ in troubles_since(events, 130)] == [300]
+    assert [seq for seq, _ in troubles_since(events, 301)] == [300]
