@@ -112,7 +112,7 @@ class Recorder:
         self._closer: BackgroundJob | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
-        self._not_before = self._told_until = self._look_at = 0.0
+        self._not_before = self._close_at = self._told_until = self._look_at = 0.0
         self._syncer = segments.Syncer(config.sync_s)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -277,8 +277,8 @@ class Recorder:
 
     def _look_after_closing(self) -> None:
         """Convert the journals that are full, or that a crash or a failing disk left."""
-        closer = self._closer
-        if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
+        closer, at_s = self._closer, max(self._not_before, self._close_at)
+        if closer is None and self._left_open and self._segment is not None and time.monotonic() >= at_s:
             self._left_open = False
             self._closer = segments.closing(self.config.directory, self._segment.path)
         elif closer is not None and not closer.running:
@@ -294,8 +294,10 @@ class Recorder:
             removed = segments.make_room(self.config.directory, self.config.max_bytes)
             self._count(bytes=written, segments=own, salvaged=len(made) - own, removed=removed)
         except OSError as error:
-            self._left_open = True
-            self._pause(error)
+            # What is open can be read as it is: only the closing waits, not the recording.
+            self._left_open, self._close_at = True, time.monotonic() + self.config.retry_s
+            self._told_until = self._close_at
+            self._failed(error.strerror or str(error))
 
     def _close_all(self) -> None:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""

@@ -237,11 +237,15 @@ def close_left_open(directory: Path, but: Path | None = None) -> list[Path]:
     for part in directory.glob(f"*segment-*{PART}"):
         part.unlink(missing_ok=True)
     left = [path for path in left_open(directory) if but is None or number_of(path) < number_of(but)]
-    made = [path for path in map(convert, left) if path is not None]
+    made = []
+    for path in left:
+        # The process of an instance that was killed may still close them, too.
+        with contextlib.suppress(FileNotFoundError):
+            made.append(convert(path))
     # A restart may need the newest one.
     for done in _sorted(directory, DONE)[:-1]:
         done.unlink(missing_ok=True)
-    return made
+    return [path for path in made if path is not None]
 
 
 def closing(directory: Path, but: Path) -> BackgroundJob:

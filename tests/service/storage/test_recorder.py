@@ -176,6 +176,39 @@ def test_a_full_disk_degrades_the_recording_and_nothing_else(
     assert len(recording) == counters["written"]
 
 
+def test_a_journal_that_cannot_be_closed_costs_no_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process of a killed instance may hold it; a failing disk shows in what is written itself."""
+    with contextlib.closing(Journal(recorder_files.journal_of(tmp_path, 1))) as left:
+        left.write(rows_of(*block(0, 100), reason="learnt"))
+    failed = type("Failed", (), {"running": False, "result": {"error": "held by another"}, "cancel": lambda self: None})
+    monkeypatch.setattr(recorder_files, "closing", lambda directory, but: failed())
+    with Recorder(RecorderConfig(tmp_path, flush_s=0.02, retry_s=60.0), 100) as recorder:
+        for start in range(100, 300, 10):
+            recorder.put(*block(start, 10), reason="learnt")
+            eventually(lambda start=start: recorder.counters()["written"] == start - 90)
+            if start == 200:
+                eventually(lambda: "held by another" in recorder.counters()["error"])
+        counters = recorder.counters()
+    assert (counters["lost"], counters["errors"], counters["degraded"]) == (0, 1, True)
+    assert len(read(tmp_path)) == 300
+
+
+def test_a_journal_that_another_process_has_closed_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in (1, 2):
+        with contextlib.closing(Journal(recorder_files.journal_of(tmp_path, number))) as left:
+            left.write(rows_of(*block(100 * number, 100), reason="learnt"))
+    convert = recorder_files.convert
+
+    def twice(journal: Path) -> Path | None:
+        if recorder_files.number_of(journal) == 1:
+            convert(journal)
+        return convert(journal)
+
+    monkeypatch.setattr(recorder_files, "convert", twice)
+    assert len(recorder_files.close_left_open(tmp_path)) == 1
+    assert len(read(tmp_path)) == 200
+
+
 @pytest.mark.parametrize("more", [0, 1], ids=["no sample comes", "a sample comes"])
 def test_a_killed_process_leaves_a_stream_that_the_next_run_closes(tmp_path: Path, more: int) -> None:
     program = (
