@@ -172,15 +172,19 @@ def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told
             session.close()
     numbers = np.arange(first, first + n)
     np.testing.assert_array_equal(received["x"][0], numbers)
-    np.testing.assert_array_equal(received["y"][0], numbers[100:])
+    # The fault may begin a few samples after the first voltage has come.
+    kept = np.isin(numbers, received["y"][0])
+    gap = np.flatnonzero(~kept)
+    assert (gap.size, gap[-1] - gap[0]) == (100, 99)
+    assert gap[0] < 100
     # 3 V are reached in steps of the slew limit; the second axis stays below it.
     expected = np.minimum(3.0, limit_V * np.arange(1, n + 1))
     np.testing.assert_allclose(received["x"][2], expected, rtol=1e-6)
-    np.testing.assert_array_equal(received["y"][2], voltages["y"][100:])
+    np.testing.assert_array_equal(received["y"][2], voltages["y"][kept])
     stage = Stage(preset("rich", seed=5))
     y_um, y2_um = stage.run(stage.initial_state(), received["x"][2], voltages["y"])
     np.testing.assert_array_equal(received["x"][3], y_um)
-    np.testing.assert_array_equal(received["y"][3], y2_um[100:])
+    np.testing.assert_array_equal(received["y"][3], y2_um[kept])
     units = summary["units"]
     assert isinstance(units, dict)
     assert units["x"]["slew_limited"] == 149
