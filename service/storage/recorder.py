@@ -214,14 +214,12 @@ class Recorder:
             for name, value in more.items():
                 self._counts[name] += value
 
-    def _failed(self, why: str) -> None:
+    def _failed(self, error: OSError | str) -> float:
+        """Count an error and tell it; returns when to try again, by ``time.monotonic``, s."""
         with self._lock:
             self._counts["errors"] += 1
-            self._error = why
-
-    def _pause(self, error: OSError) -> None:
-        self._not_before = time.monotonic() + self.config.retry_s
-        self._failed(error.strerror or str(error))
+            self._error = error if isinstance(error, str) else error.strerror or str(error)
+        return time.monotonic() + self.config.retry_s
 
     def _begin_segment(self) -> segments.Journal:
         directory = self.config.directory
@@ -254,7 +252,7 @@ class Recorder:
                 with self._lock:
                     self._error = ""
         except OSError as error:
-            self._pause(error)
+            self._not_before = self._failed(error)
             self._count(lost=len(rows) - done)
             self._leave_segment()
 
@@ -272,8 +270,8 @@ class Recorder:
         self._look_at = now + _LOOK_S
         if self._segment.vanished:
             self._leave_segment()
-            self._told_until = now + self.config.retry_s
-            self._failed(f"{self.config.directory} vanished while it was recorded into; it is made anew")
+            why = f"{self.config.directory} vanished while it was recorded into; it is made anew"
+            self._told_until = self._failed(why)
 
     def _look_after_closing(self) -> None:
         """Convert the journals that are full, or that a crash or a failing disk left."""
@@ -294,10 +292,9 @@ class Recorder:
             removed = segments.make_room(self.config.directory, self.config.max_bytes)
             self._count(bytes=written, segments=own, salvaged=len(made) - own, removed=removed)
         except OSError as error:
-            # What is open can be read as it is: only the closing waits, not the recording.
-            self._left_open, self._close_at = True, time.monotonic() + self.config.retry_s
-            self._told_until = self._close_at
-            self._failed(error.strerror or str(error))
+            # An open journal can be read as it is: only the closing waits, the recording goes on.
+            self._left_open = True
+            self._close_at = self._told_until = self._failed(error)
 
     def _close_all(self) -> None:
         """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
