@@ -213,11 +213,6 @@ class Parts(Numbers):
         """The good estimate to return to; a view."""
         return Mark(self.mark_beta[0], self.mark_covariance[: self.mark_beta.shape[1]])
 
-    @property
-    def next_mark(self) -> Mark:
-        """A newer one; a view."""
-        return Mark(self.mark_beta[1], self.mark_covariance[self.mark_beta.shape[1] :])
-
     def go_back(self) -> None:
         """The readings do not follow the drive: return to the older good estimate, or to a jump after it."""
         self.filter.restore(self.mark)
@@ -494,7 +489,7 @@ class Learner:
 
     def _run(self, stage: int, sample: Sample = _NO_SAMPLE) -> int:
         parts, home = self.parts, self.parts.home
-        # Of these kinds: others would be compiled for, which takes a minute.
+        # Plain numbers: each other type would be compiled for, which takes a minute.
         given = int(sample.seq), float(sample.t_s), float(sample.u_V), float(sample.y_um)
         return int(order.go_on(parts.handle, parts.window.handle, home.numbers, home.config, stage, *given))
 

@@ -41,7 +41,7 @@ def busy() -> None:
 
 
 def liar(endpoint: str) -> None:
-    """Answer each query by a lie; command, and publish samples and models, with a false tag or what was said before."""
+    """Answer each query with a lie; command, and publish samples and models, with a false or a recorded tag."""
     stop, keys = StopSignal(), Keys(STAGE, AXIS)
     with open_client(endpoint, 20.0) as session:
 
@@ -61,7 +61,7 @@ def liar(endpoint: str) -> None:
             for attached in (bytes(32), sample.attachment):
                 session.put(sample.key_expr, payload, attachment=attached)
 
-        # Not its own: those would come back to it.
+        # Its own messages would come back to it.
         heard = {"allowed_origin": zenoh.Locality.REMOTE}
         entities: list[Any] = [
             session.declare_queryable(key, answer, complete=True) for key in (keys.feedforward, keys.status)

@@ -470,7 +470,7 @@ class Monitor:
         self._lock = threading.Lock()
         self.session = open_client(endpoint, 10.0)
         keys, self._by = Keys(STAGE, AXIS), own_authenticator()
-        #: What a stranger may have said is not taken.
+        #: Keys of which only signed messages count.
         self._signed = {keys.sample, keys.command, keys.status}
         self._subscribers = [
             self.session.declare_subscriber(key, self._guarded(take))

@@ -822,7 +822,7 @@ def test_the_last_good_estimate_is_served_while_readings_are_on_trial(
     at = ATS[0]
     u, clean = motions["tones"]
     learner = Learner.from_state(warm["tones", at])
-    good = [learner.parts.mark.beta.copy(), learner.parts.next_mark.beta.copy()]
+    good = [learner.parts.mark.beta.copy(), learner.parts.mark_beta[1].copy()]
     y = wrong(fault, clean, at, range_of(model), 1500)
     for k in range(at, at + 1500):
         before = learner.parts.filter.beta

@@ -79,7 +79,7 @@ impl Lease {
         Lease { session, by, owners: format!("{base}/owner/"), sender: hex(sender), held: None }
     }
 
-    /// Become the owner, if this controller is not yet; `force`: although another one owns it, which is told so.
+    /// Become the owner, if this controller is not yet; `force`: even if another one owns it, which then gets an error.
     pub fn take(&mut self, force: bool) -> Result<()> {
         let rivals = match &self.held {
             Some(held) => locked(&held.others).clone(),
