@@ -18,7 +18,7 @@ from dehyst.service.client.client import Client
 from dehyst.service.config.settings import read_config
 from dehyst.service.protocol.model import fingerprint
 from dehyst.service.protocol.query import STALE
-from dehyst.service.runtime.session import open_client, open_service
+from dehyst.service.runtime.session import SURELY, open_client, open_service
 from dehyst.service.server.axis_loading import load_axis
 from dehyst.service.storage.checkpoint import CheckpointFolder, decode_checkpoint
 from dehyst.service.storage.model_file import BundleMeta, write_bundle
@@ -29,8 +29,8 @@ from tests.service.living import Asker, Process, Stage, eventually, samples
 pytestmark = pytest.mark.e2e
 ROOT = Path(__file__).resolve().parents[3]
 EXTRA = 'recorder = "rec"\ncheckpoints = "kept"\ncheckpoint_s = 0.5\nstale_s = 0.4\nserved = "lssvm_adaptive"\n'
-#: A learner that takes seconds for thousands of samples.
-SLOW = "[axis.learner]\nwindow = 1500\nlearn_every = 2\n"
+#: A queue and a learner that takes seconds for it.
+SLOW = "queue_samples = 100_000\n[axis.learner]\nwindow = 1500\nlearn_every = 2\n"
 #: Loaded before anything else: a clock of the wall that stands a day earlier and runs backwards.
 BACKWARDS = "import time\n_now = time.time\n_start = _now()\ntime.time = lambda: 2 * _start - _now() - 86400.0\n"
 
@@ -180,12 +180,12 @@ def test_what_waits_at_a_stop_is_recorded_and_learnt_by_the_next_start(
     endpoint = f"tcp/127.0.0.1:{port}"
     serve = ("serve", "--config", str(config))
     processes.append(Process(*serve))
-    n = 19_000
+    n, a_message = 57_000, 9500  # a start learns 60,000 again at most
     with Client.connect(endpoint, timeout_s=10.0, wait_s=20.0) as client, open_client([endpoint], 20.0) as session:
-        # One message, which the learner needs seconds for.
-        session.put("dehyst/v1/demo/x/sample", samples(0, n // 2))
-        session.put("dehyst/v1/demo/x/sample", samples(n // 2, n - n // 2))
-        eventually(lambda: client.status()["samples"]["waiting"] > 8000)
+        # Together the learner needs seconds for them.
+        for first in range(0, n, a_message):
+            session.put("dehyst/v1/demo/x/sample", samples(first, a_message), congestion_control=SURELY)
+        eventually(lambda: client.status()["samples"]["waiting"] > n // 2)
     processes[0].send(signal.SIGTERM)
     begun = time.monotonic()
     log = processes[0].process.communicate(timeout=60)[1]
